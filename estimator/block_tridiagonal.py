@@ -1,0 +1,173 @@
+"""Symmetric block-tridiagonal matrices over particles: layout, assembly from elements, Cholesky factorisation, solves.
+
+Particles ordered by reverse Cuthill-McKee [Cuthill & McKee 1969, doi:10.1145/800195.805928] interact only within a band;
+cutting the order into blocks as wide as the band leaves a block-tridiagonal matrix, whose Cholesky factor costs
+O(n band^2) instead of O(n^3). `Layout` holds the order, `BlockTridiagonal` the numbers. Every particle carries three
+degrees of freedom. Not a general sparse solver: the band must fit.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float, Int
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+
+class Layout(eqx.Module):
+    """Which particle sits where in the blocks; the last block is padded."""
+
+    slot: Int[np.ndarray, " n"] | Int[Array, " n"]
+    """Place of each particle in the padded order."""
+    n_blocks: int = eqx.field(static=True)
+    width: int = eqx.field(static=True)
+    """Particles in a block."""
+
+    @classmethod
+    def from_pattern(cls, pattern: sp.csr_matrix) -> "Layout":
+        """Order the particles of a symmetric n x n sparsity pattern so that it becomes block-tridiagonal."""
+        order = reverse_cuthill_mckee(pattern.tocsr(), symmetric_mode=True)
+        rank = np.empty(len(order), dtype=np.int64)
+        rank[order] = np.arange(len(order))
+        rows, columns = pattern.nonzero()
+        band = max(1, int(np.abs(rank[rows] - rank[columns]).max(initial=1)))
+        n_blocks = max(1, len(order) // band)
+        return cls(slot=rank, n_blocks=n_blocks, width=-(-len(order) // n_blocks))
+
+    def blocks(self, values: Float[Array, "n *rest"]) -> Float[Array, "blocks width *rest"]:
+        """Lay particle rows out in blocks; padding is zero."""
+        rest = values.shape[1:]
+        padded = jnp.zeros((self.n_blocks * self.width, *rest), values.dtype).at[self.slot].set(values)
+        return padded.reshape(self.n_blocks, self.width, *rest)
+
+    def rows(self, blocks: Float[Array, "blocks width *rest"]) -> Float[Array, "n *rest"]:
+        """The inverse of `blocks`."""
+        return blocks.reshape(self.n_blocks * self.width, *blocks.shape[2:])[self.slot]
+
+    def pair_index(self, vertices: Int[np.ndarray, "m p"]) -> Int[np.ndarray, "m p p"]:
+        """Where the 3x3 window of each ordered vertex pair of an element is stored; pairs above the diagonal fall off.
+
+        A vertex of -1 stands for 'none'.
+
+        Raises:
+            ValueError: a pair lies outside the band that the layout was made for.
+        """
+        rank = np.append(np.asarray(self.slot), -1)[vertices]
+        row, column = rank[:, :, None], rank[:, None, :]
+        jump = row // self.width - column // self.width
+        absent = (row < 0) | (column < 0)
+        if np.any((np.abs(jump) > 1) & ~absent):
+            raise ValueError("an element couples particles further apart than the layout's band.")
+        window = (jump * self.n_blocks + column // self.width) * self.width**2
+        window = window + (row % self.width) * self.width + column % self.width
+        return np.where(absent | (jump < 0), 2 * self.n_blocks * self.width**2, window)
+
+
+class BlockTridiagonal(eqx.Module):
+    """A symmetric block-tridiagonal matrix."""
+
+    diagonal: Float[Array, "blocks m m"]
+    lower: Float[Array, "blocks-1 m m"]
+    """Block (k + 1, k)."""
+
+
+class BlockCholesky(eqx.Module):
+    """The factor L of A = L L^T, block-bidiagonal."""
+
+    diagonal: Float[Array, "blocks m m"]
+    lower: Float[Array, "blocks-1 m m"]
+
+
+def assemble(
+    layout: Layout, elements: list[tuple[Int[Array, "m p p"], Float[Array, "m p 3 p 3"]]]
+) -> BlockTridiagonal:
+    """Sum element matrices, each given with its `Layout.pair_index`; padding gets an identity."""
+    nb, w = layout.n_blocks, layout.width
+    index = jnp.concatenate([i.reshape(-1) for i, _ in elements])
+    windows = jnp.concatenate([jnp.swapaxes(h, 2, 3).reshape(-1, 3, 3) for _, h in elements])
+    storage = jnp.zeros((2 * nb * w * w + 1, 3, 3), windows.dtype).at[index].add(windows)
+    blocks = storage[:-1].reshape(2, nb, w, w, 3, 3).swapaxes(3, 4).reshape(2, nb, 3 * w, 3 * w)
+    return add_to_diagonal(
+        layout, BlockTridiagonal(diagonal=blocks[0], lower=blocks[1, : nb - 1]), jnp.zeros((len(layout.slot), 3, 3)), 1.0
+    )
+
+
+def add_to_diagonal(
+    layout: Layout, matrix: BlockTridiagonal, windows: Float[Array, "n 3 3"], padding: float = 0.0
+) -> BlockTridiagonal:
+    """Add a 3x3 window to each particle's place on the diagonal, and a multiple of the identity to the padding's."""
+    nb, w = layout.n_blocks, layout.width
+    filled = jnp.broadcast_to(padding * jnp.eye(3, dtype=windows.dtype), (nb * w, 3, 3)).at[layout.slot].set(windows)
+    place = jnp.arange(w)
+    diagonal = matrix.diagonal.reshape(nb, w, 3, w, 3)
+    diagonal = diagonal.at[:, place, :, place, :].add(filled.reshape(nb, w, 3, 3).swapaxes(0, 1))
+    return BlockTridiagonal(diagonal=diagonal.reshape(nb, 3 * w, 3 * w), lower=matrix.lower)
+
+
+def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
+    """Factor A = L L^T block by block; NaN where A is not positive definite."""
+
+    def step(
+        previous: Float[Array, "m m"], blocks: tuple[Float[Array, "m m"], Float[Array, "m m"]]
+    ) -> tuple[Float[Array, "m m"], tuple[Float[Array, "m m"], Float[Array, "m m"]]]:
+        diagonal, lower = blocks
+        coupling = solve_triangular(previous, lower.T, lower=True).T
+        factor = jnp.linalg.cholesky(diagonal - coupling @ coupling.T, symmetrize_input=False)
+        return factor, (factor, coupling)
+
+    first = jnp.linalg.cholesky(matrix.diagonal[0], symmetrize_input=False)
+    _, (rest, lower) = jax.lax.scan(step, first, (matrix.diagonal[1:], matrix.lower))
+    return BlockCholesky(diagonal=jnp.concatenate([first[None], rest]), lower=lower)
+
+
+def multiply(layout: Layout, matrix: BlockTridiagonal, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """A x for one vector given per particle."""
+    v = layout.blocks(x).reshape(layout.n_blocks, -1)
+    out = jnp.einsum("bij,bj->bi", matrix.diagonal, v)
+    out = out.at[1:].add(jnp.einsum("bij,bj->bi", matrix.lower, v[:-1]))
+    out = out.at[:-1].add(jnp.einsum("bji,bj->bi", matrix.lower, v[1:]))
+    return layout.rows(out.reshape(layout.n_blocks, layout.width, 3))
+
+
+def solve_lower(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float[Array, "blocks m k"]:
+    """L z = rhs."""
+
+    def step(
+        previous: Float[Array, "m k"],
+        blocks: tuple[Float[Array, "m m"], Float[Array, "m m"], Float[Array, "m k"]],
+    ) -> tuple[Float[Array, "m k"], Float[Array, "m k"]]:
+        diagonal, lower, right = blocks
+        z = solve_triangular(diagonal, right - lower @ previous, lower=True)
+        return z, z
+
+    lower = jnp.concatenate([jnp.zeros_like(factor.diagonal[:1]), factor.lower])
+    return jax.lax.scan(step, jnp.zeros_like(rhs[0]), (factor.diagonal, lower, rhs))[1]
+
+
+def solve_upper(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float[Array, "blocks m k"]:
+    """L^T z = rhs."""
+
+    def step(
+        following: Float[Array, "m k"],
+        blocks: tuple[Float[Array, "m m"], Float[Array, "m m"], Float[Array, "m k"]],
+    ) -> tuple[Float[Array, "m k"], Float[Array, "m k"]]:
+        diagonal, lower, right = blocks
+        z = solve_triangular(diagonal, right - lower.T @ following, lower=True, trans=1)
+        return z, z
+
+    lower = jnp.concatenate([factor.lower, jnp.zeros_like(factor.diagonal[:1])])
+    return jax.lax.scan(step, jnp.zeros_like(rhs[0]), (factor.diagonal, lower, rhs), reverse=True)[1]
+
+
+def solve(layout: Layout, factor: BlockCholesky, rhs: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """A z = rhs for one right-hand side given per particle."""
+    blocks = layout.blocks(rhs).reshape(layout.n_blocks, 3 * layout.width, 1)
+    z = solve_upper(factor, solve_lower(factor, blocks))
+    return layout.rows(z.reshape(layout.n_blocks, layout.width, 3))
+
+
+def half_log_determinant(factor: BlockCholesky) -> Float[Array, ""]:
+    """Half of log det A."""
+    return jnp.sum(jnp.log(jnp.diagonal(factor.diagonal, axis1=1, axis2=2)))

@@ -1,0 +1,129 @@
+"""What acts on the sheet from outside, besides the unknown attachments: weight, the bed it lies on, the grip.
+
+Each is a `Term` with one particle an element. The bed is frictionless and only pushes; the grip is the paper's C_a.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jiggle_mj.estimator.energy import Term
+
+
+class Weight(Term):
+    """-m g . x."""
+
+    vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
+    force: Float[Array, "n 3"]
+    """Mass times gravity [N]."""
+
+    @classmethod
+    def build(
+        cls, particle_area: Float[np.ndarray, " n"], *, areal_density: float, gravity: tuple[float, float, float]
+    ) -> "Weight":
+        """Weight of each particle's share of the sheet."""
+        force = areal_density * particle_area[:, None] * np.asarray(gravity)
+        return cls(vertices=np.arange(len(force))[:, None], force=jnp.asarray(force))
+
+    def energy(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
+        """[J]."""
+        return -jnp.sum(self.force * x[:, 0], axis=1)
+
+    def gradient(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3"]:
+        """[N]."""
+        return -self.force[:, None]
+
+    def hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
+        """Zero."""
+        return jnp.zeros((len(x), 1, 3, 1, 3), x.dtype)
+
+    def positive_hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
+        """Zero."""
+        return self.hessian(x)
+
+
+class Bed(Term):
+    """k/2 min(0, (x - x_rest) . up)^2: the bed is where the sheet lay at rest, and only pushes.
+
+    Taking the bed's height from the sheet itself keeps errors of the camera's height out of the contact.
+    """
+
+    vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
+    height: Float[Array, " n"]
+    """Height of the bed below each particle [m]."""
+    up: Float[Array, " 3"]
+    """Unit vector against gravity."""
+    stiffness: Float[Array, ""]
+    """[N/m] per particle."""
+
+    @classmethod
+    def build(cls, rest: Float[np.ndarray, "n 3"], *, up: Float[np.ndarray, " 3"], stiffness: float) -> "Bed":
+        """A bed that touches the sheet at rest everywhere."""
+        return cls(
+            vertices=np.arange(len(rest))[:, None],
+            height=jnp.asarray(rest @ up),
+            up=jnp.asarray(up),
+            stiffness=jnp.asarray(stiffness, dtype=float),
+        )
+
+    def _depth(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
+        return jnp.minimum(x[:, 0] @ self.up - self.height, 0)
+
+    def energy(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
+        """[J]."""
+        return 0.5 * self.stiffness * self._depth(x) ** 2
+
+    def gradient(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3"]:
+        """[N]."""
+        return (self.stiffness * self._depth(x)[:, None] * self.up)[:, None]
+
+    def hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
+        """The bed's stiffness where it is touched [N/m]."""
+        touched = jnp.where(self._depth(x) < 0, self.stiffness, 0)
+        return (touched[:, None, None] * jnp.outer(self.up, self.up))[:, None, :, None, :]
+
+    def positive_hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
+        """The Hessian, which is semi-definite already."""
+        return self.hessian(x)
+
+
+class Grip(Term):
+    """Springs from the tip to the held particles, the paper's C_a: k_a/2 (|x_j - u| - r_j)^2."""
+
+    vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
+    tip: Float[Array, " 3"]
+    """u [m]."""
+    length: Float[Array, " n"]
+    """r_j, the distance to the tip when the jaws closed [m]."""
+    stiffness: Float[Array, " n"]
+    """k_a [N/m], zero for particles that are not held."""
+
+    @classmethod
+    def build(
+        cls, x: Float[Array, "n 3"], tip: Float[Array, " 3"], *, radius: float, stiffness: float
+    ) -> "Grip":
+        """Close the jaws at `tip` around the particles x within the radius."""
+        length = jnp.linalg.norm(x - tip, axis=1)
+        return cls(
+            vertices=np.arange(len(x))[:, None],
+            tip=tip,
+            length=length,
+            stiffness=jnp.where(length <= radius, stiffness, 0.0),
+        )
+
+    def _stretch(self, x: Float[Array, "n 1 3"]) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
+        d = x[:, 0] - self.tip
+        squared = jnp.sum(d**2, axis=1)
+        return d, jnp.sqrt(jnp.where(squared > 0, squared, jnp.finfo(x.dtype).tiny))
+
+    def energy(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
+        """[J]."""
+        return 0.5 * self.stiffness * (self._stretch(x)[1] - self.length) ** 2
+
+    def positive_hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
+        """Along the spring k_a, across it k_a (1 - r/|d|) where that is positive [N/m]."""
+        d, distance = self._stretch(x)
+        along = jnp.einsum("ni,nj->nij", d, d) / distance[:, None, None] ** 2
+        across = jnp.maximum(1 - self.length / distance, 0)[:, None, None]
+        window = along + across * (jnp.eye(3, dtype=x.dtype) - along)
+        return (self.stiffness[:, None, None] * window)[:, None, :, None, :]

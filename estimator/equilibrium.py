@@ -1,0 +1,108 @@
+"""The sheet's equilibrium x*(b, u) = argmin U by projected Newton, and its derivatives by the implicit function theorem.
+
+Each step factors the positive semi-definite stand-in of the Hessian and backtracks until the energy falls enough
+[Nocedal & Wright 2006, Numerical Optimization, alg. 3.1]. Derivatives use the true Hessian at the solution:
+dx/dtheta = -H^-1 d(grad U)/dtheta. A step that cannot lower the energy ends the search and is reported, not hidden.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jiggle_mj.estimator.block_tridiagonal import add_to_diagonal, cholesky, multiply, solve
+from jiggle_mj.estimator.energy import SheetEnergy
+
+
+class Equilibrium(eqx.Module):
+    """What the search ended with."""
+
+    x: Float[Array, "n 3"]
+    """[m]."""
+    force: Float[Array, ""]
+    """Largest unbalanced force component [N]."""
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def equilibrium(
+    energy: SheetEnergy,
+    b: Float[Array, " n"],
+    start: Float[Array, "n 3"],
+    *,
+    force_tolerance: float = 1e-8,
+    max_steps: int = 200,
+) -> Equilibrium:
+    """Minimise U(x; b) from `start` until no particle feels more than `force_tolerance` [N].
+
+    Reverse and forward differentiable in every float of `energy` and in `b`; not in `start`, on which a minimum does
+    not depend.
+    """
+    dynamic, static = eqx.partition(energy, eqx.is_inexact_array)
+    x, force, steps = _search(dynamic, static, b, jax.lax.stop_gradient(start), force_tolerance, max_steps)
+    return Equilibrium(x=x, force=force, steps=steps, converged=force <= force_tolerance)
+
+
+def _search(dynamic, static, b, start, force_tolerance, max_steps):  # noqa: ANN001, ANN202
+    """The implicitly differentiated search; see `equilibrium`."""
+
+    @jax.custom_jvp
+    def solution(dynamic, b):  # noqa: ANN001, ANN202
+        return _minimise(eqx.combine(dynamic, static), b, start, force_tolerance, max_steps)
+
+    @solution.defjvp
+    def tangent(primals, tangents):  # noqa: ANN001, ANN202
+        out = solution(*primals)
+        x = out[0]
+        _, change = jax.jvp(lambda d, b: eqx.combine(d, static).gradient(x, b), primals, tangents)
+        energy = eqx.combine(primals[0], static)
+        matrix = energy.hessian(x, primals[1])
+        dx = _implicit_solve(energy, matrix, -change)
+        return out, (dx, jnp.zeros_like(out[1]), jnp.zeros(out[2].shape, jax.dtypes.float0))
+
+    return solution(dynamic, b)
+
+
+def _implicit_solve(energy, matrix, rhs):  # noqa: ANN001, ANN202
+    """H^-1 rhs with a transpose rule, so that reverse mode goes through it."""
+    layout = energy.layout
+    return jax.lax.custom_linear_solve(
+        lambda v: multiply(layout, matrix, v),
+        rhs,
+        lambda _, r: solve(layout, cholesky(matrix), r),
+        symmetric=True,
+    )
+
+
+def _minimise(energy, b, start, force_tolerance, max_steps):  # noqa: ANN001, ANN202
+    """Projected Newton with backtracking; returns x, the largest force, and the number of steps."""
+    layout = energy.layout
+
+    def newton(state):  # noqa: ANN001, ANN202
+        x, value, gradient, count, _ = state
+        matrix = energy.hessian(x, b, positive=True)
+        shift = 1e-9 * jnp.max(jnp.abs(matrix.diagonal))
+        matrix = add_to_diagonal(layout, matrix, jnp.broadcast_to(shift * jnp.eye(3), (len(x), 3, 3)))
+        step = solve(layout, cholesky(matrix), -gradient)
+        slope = jnp.sum(step * gradient)
+
+        def too_far(trial):  # noqa: ANN001, ANN202
+            length, new = trial
+            return (~(new <= value + 1e-4 * length * slope + 1e-15 * jnp.abs(value))) & (length > 1e-8)
+
+        def halve(trial):  # noqa: ANN001, ANN202
+            length, _ = trial
+            return length / 2, energy.value(x + length / 2 * step, b)
+
+        length, new = jax.lax.while_loop(too_far, halve, (jnp.ones(()), energy.value(x + step, b)))
+        stuck = length <= 1e-8
+        moved = jnp.where(stuck, x, x + length * step)
+        return moved, jnp.where(stuck, value, new), energy.gradient(moved, b), count + 1, stuck
+
+    def unfinished(state):  # noqa: ANN001, ANN202
+        _, _, gradient, count, stuck = state
+        return (jnp.max(jnp.abs(gradient)) > force_tolerance) & (count < max_steps) & ~stuck
+
+    first = (start, energy.value(start, b), energy.gradient(start, b), jnp.zeros((), int), jnp.zeros((), bool))
+    x, _, gradient, count, _ = jax.lax.while_loop(unfinished, newton, first)
+    return x, jnp.max(jnp.abs(gradient)), count

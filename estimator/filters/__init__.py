@@ -1,0 +1,1 @@
+"""Ways to update the belief with one observation."""

@@ -1,0 +1,222 @@
+"""Implicit extended Kalman filter: the measurement model is the equilibrium itself, with an honest force error.
+
+    y = x + n_y,  n_y ~ N(0, R)         observed positions, a 3x3 block a particle, no row for a missing one
+    grad U(x; b) = n_f,  n_f ~ N(0, tau^2 I)    what the model gets wrong, in newtons; no row for a held particle
+
+Gauss-Newton on (x, b) from the observed state. With H the Hessian of U, D = blkdiag(x_i - a_i), W = tau^-2 (0 where held),
+A = R^-1 + H W H and N^-1 = W - W H A^-1 H W, eliminating x leaves for b the evidence D^T N^-1 D; each frame enters once.
+Linear in b at the observed state, so the wild response of a free sheet at b = 0 is never needed. The equilibrium condition
+as an implicit measurement follows the errors-in-variables form of the Gauss-Helmert model [Foerstner & Wrobel 2016,
+Photogrammetric Computer Vision, sec. 4.8]. Needs correspondences.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.block_tridiagonal import (
+    BlockCholesky,
+    BlockTridiagonal,
+    Layout,
+    add_to_diagonal,
+    assemble,
+    cholesky,
+    solve,
+    solve_lower,
+)
+from jiggle_mj.estimator.energy import SheetEnergy
+from jiggle_mj.estimator.mesh import SheetMesh, pattern
+
+
+class Evidence(eqx.Module):
+    """One frame's measurements of the particles."""
+
+    y: Float[Array, "n 3"]
+    """Observed positions, anything finite where there is none [m]."""
+    precision: Float[Array, "n 3 3"]
+    """R^-1, zero where a particle is missing [1/m^2]."""
+    held: Bool[Array, " n"]
+    """Particles in the grip, whose balance of forces is unknown."""
+
+
+class Update(eqx.Module):
+    """The outcome of one frame."""
+
+    belief: BoundaryBelief
+    x: Float[Array, "n 3"]
+    """State after the update [m]."""
+    b: Float[Array, " n"]
+    """Non-negative mean [N/m]."""
+    nis: Float[Array, ""]
+    """Squared residuals, whitened, per degree of freedom; 1 where the stated noises are right."""
+
+
+class ImplicitFilter(eqx.Module):
+    """The filter for one sheet."""
+
+    energy: SheetEnergy
+    neighbours: Int[Array, "n p"]
+    """Particles coupled to each, itself included, padded with n."""
+    slots: tuple[Int[Array, "m p p"], ...]
+    """Where each term's Hessian windows go in the rows of H."""
+    layout: Layout
+    """Twice the energy's band: the pattern of H^2."""
+    places: Int[Array, "n p p"]
+    force_sd: Float[Array, ""]
+    """tau [N]."""
+    state_steps: int = eqx.field(static=True)
+    joint_steps: int = eqx.field(static=True)
+
+    @classmethod
+    def build(
+        cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, state_steps: int = 6, joint_steps: int = 2
+    ) -> "ImplicitFilter":
+        """Prepare the index tables for a mesh and its energy."""
+        near = mesh.adjacency.tocsr()
+        near.sort_indices()
+        degree = np.diff(near.indptr)
+        neighbours = np.full((mesh.n, degree.max()), -1)
+        column = np.arange(len(near.indices)) - np.repeat(near.indptr[:-1], degree)
+        neighbours[np.repeat(np.arange(mesh.n), degree), column] = near.indices
+        position = {(i, j): k for i, row in enumerate(neighbours.tolist()) for k, j in enumerate(row) if j >= 0}
+        width = neighbours.shape[1]
+        slots = tuple(
+            jnp.asarray([[[i * width + position[i, j] for j in element] for i in element] for element in vertices])
+            for vertices in (np.asarray(term.vertices).tolist() for term in energy.terms)
+        )
+        two_rings = (near.astype(int) @ near.astype(int)).tocoo()
+        layout = Layout.from_pattern(pattern(mesh.n, np.column_stack([two_rings.row, two_rings.col])))
+        return cls(
+            energy=energy,
+            neighbours=jnp.asarray(np.where(neighbours < 0, mesh.n, neighbours)),
+            slots=slots,
+            layout=layout,
+            places=jnp.asarray(layout.pair_index(neighbours)),
+            force_sd=jnp.asarray(force_sd, dtype=float),
+            state_steps=state_steps,
+            joint_steps=joint_steps,
+        )
+
+    def update(self, belief: BoundaryBelief, evidence: Evidence, start: Float[Array, "n 3"]) -> Update:
+        """Take one frame into the belief, searching the state from `start` [m]."""
+        b = belief.non_negative_mean()
+        x = self._settle(start, b, evidence)
+        updated = belief
+        for _ in range(self.joint_steps):
+            frame = self._linearise(x, b, evidence)
+            gained, shift = self._information(frame, b)
+            updated = belief.add(gained, shift)
+            new_b = updated.non_negative_mean()
+            x = x + self._state_step(frame, evidence, new_b - b)
+            b = new_b
+        weight = self._force_weight(evidence)
+        g = self.energy.gradient(x, b)
+        squares = 2 * self._cost(x, b, evidence)
+        observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
+        degrees = observed + 3 * jnp.sum(weight > 0) - 3 * len(x)
+        del g
+        return Update(belief=updated, x=x, b=b, nis=squares / jnp.maximum(degrees, 1))
+
+    def _force_weight(self, evidence: Evidence) -> Float[Array, " n"]:
+        return jnp.where(evidence.held, 0.0, self.force_sd**-2)
+
+    def _cost(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> Float[Array, ""]:
+        off = evidence.y - x
+        force = jnp.sum(self.energy.gradient(x, b) ** 2, axis=1)
+        seen = jnp.einsum("ni,nij,nj->", off, evidence.precision, off)
+        return 0.5 * (seen + jnp.sum(self._force_weight(evidence) * force))
+
+    def _settle(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
+        """State-only Levenberg-Marquardt steps at fixed b [Nocedal & Wright 2006, sec. 10.3]."""
+
+        def step(_, state):  # noqa: ANN001, ANN202
+            x, cost, damping = state
+            frame = self._linearise(x, b, evidence, damping)
+            new = x + self._state_step(frame, evidence, jnp.zeros_like(b))
+            new_cost = self._cost(new, b, evidence)
+            better = new_cost < cost
+            damping = jnp.where(better, damping / 10, damping * 10)
+            return jnp.where(better, new, x), jnp.where(better, new_cost, cost), damping
+
+        first = (x, self._cost(x, b, evidence), jnp.asarray(1.0, x.dtype))
+        return jax.lax.fori_loop(0, self.state_steps, step, first)[0]
+
+    def _linearise(
+        self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence, damping: float | Array = 0.0
+    ) -> "_Frame":
+        n, width = self.neighbours.shape
+        rows = jnp.zeros((n * width, 3, 3), x.dtype)
+        for term, slot in zip(self.energy.terms, self.slots, strict=True):
+            windows = jnp.swapaxes(term.hessian(x[term.vertices]), 2, 3).reshape(-1, 3, 3)
+            rows = rows.at[slot.reshape(-1)].add(windows)
+        rows = rows.reshape(n, width, 3, 3)
+        itself = self.neighbours == jnp.arange(n)[:, None]
+        rows = rows + jnp.where(itself[:, :, None, None], (b[:, None, None] * jnp.eye(3))[:, None], 0.0)
+        weight = self._force_weight(evidence)
+        squares = jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows)
+        matrix = assemble(self.layout, [(self.places, squares)])
+        ground = evidence.precision + (FAINT + damping / PERTURBATION**2) * jnp.eye(3)
+        matrix = add_to_diagonal(self.layout, matrix, ground)
+        return _Frame(
+            x=x,
+            d=x - self.energy.rest,
+            gradient=self.energy.gradient(x, b),
+            rows=rows,
+            weight=weight,
+            factor=cholesky(matrix),
+            off=jnp.where(jnp.trace(evidence.precision, axis1=1, axis2=2)[:, None] > 0, evidence.y - x, 0.0),
+        )
+
+    def _transposed(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """H^T v."""
+        parts = jnp.einsum("npij,ni->npj", rows, v)
+        return jnp.zeros((len(v) + 1, 3), v.dtype).at[self.neighbours].add(parts)[:-1]
+
+    def _state_step(self, frame: "_Frame", evidence: Evidence, change: Float[Array, " n"]) -> Float[Array, "n 3"]:
+        """The best move of x for a given change of b."""
+        force = frame.gradient + frame.d * change[:, None]
+        pull = jnp.einsum("nij,nj->ni", evidence.precision, frame.off)
+        rhs = pull - self._transposed(frame.rows, frame.weight[:, None] * force)
+        return solve(self.layout, frame.factor, rhs)
+
+    def _information(
+        self, frame: "_Frame", b: Float[Array, " n"]
+    ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+        """D^T N^-1 D and the shift that goes with it."""
+        n, width = self.neighbours.shape
+        layout, w = self.layout, frame.weight
+        spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, frame.d)
+        columns = jnp.broadcast_to(jnp.arange(n)[:, None], (n, width))
+        V = jnp.zeros((n + 1, n, 3), spread.dtype).at[self.neighbours, columns].add(spread)[:-1]
+        V = layout.blocks(V.swapaxes(1, 2)).reshape(layout.n_blocks, 3 * layout.width, n)
+        Z = solve_lower(frame.factor, V)
+        gained = jnp.diag(w * jnp.sum(frame.d**2, axis=1)) - jnp.einsum("bki,bkj->ij", Z, Z)
+
+        residual = frame.gradient + self._apply(frame.rows, frame.off)
+        back = solve(layout, frame.factor, self._transposed(frame.rows, w[:, None] * residual))
+        whitened = w[:, None] * (residual - self._apply(frame.rows, back))
+        return gained, gained @ b - jnp.sum(frame.d * whitened, axis=1)
+
+    def _apply(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """H v."""
+        padded = jnp.concatenate([v, jnp.zeros((1, 3), v.dtype)])
+        return jnp.einsum("npij,npj->ni", rows, padded[self.neighbours])
+
+
+class _Frame(eqx.Module):
+    """The model linearised at a state."""
+
+    x: Float[Array, "n 3"]
+    d: Float[Array, "n 3"]
+    gradient: Float[Array, "n 3"]
+    rows: Float[Array, "n p 3 3"]
+    weight: Float[Array, " n"]
+    factor: BlockCholesky
+    off: Float[Array, "n 3"]
+
+
+FAINT = 1e-2**-2 * 1e-4
+PERTURBATION = 2e-3

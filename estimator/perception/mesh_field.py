@@ -1,0 +1,71 @@
+"""Smooth fields over the mesh: filling in what was not measured, and local derivatives.
+
+The fill minimises sum_i c_i |f_i - m_i|^2 + stiffness |L f|^2 with the umbrella Laplacian L: it continues measured
+values linearly, and follows them where they are trusted. Knows nothing of images or mechanics.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array, csc_array, diags_array
+from scipy.sparse.linalg import splu
+
+LEAST_CONFIDENCE = 1e-6
+"""Keeps the fill solvable where nothing was measured at all: it then tends to 0."""
+
+
+class MeshField:
+    """Fields over one triangle mesh."""
+
+    def __init__(self, uv: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"]):
+        n = len(uv)
+        pairs = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])), axis=0)
+        i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+        adjacency = csr_array((np.ones(len(i)), (i, j)), shape=(n, n))
+        degree = adjacency.sum(axis=1)
+        self._mean = diags_array(1 / degree) @ adjacency
+        laplacian = diags_array(np.ones(n)) - self._mean
+        self._roughness = csc_array(laplacian.T @ laplacian)
+        self._neighbours = [adjacency.indices[adjacency.indptr[k] : adjacency.indptr[k + 1]] for k in range(n)]
+        self._gradient = _gradient(uv, i, j)
+
+    def fill(
+        self,
+        measured: Float[np.ndarray, "n k"],
+        confidence: Float[np.ndarray, " n"] | Bool[np.ndarray, " n"],
+        *,
+        stiffness: float = 0.1,
+    ) -> Float[np.ndarray, "n k"]:
+        """The smooth field that follows `measured` where `confidence` is above 0; NaN there is not allowed."""
+        trust = np.asarray(confidence, float) + LEAST_CONFIDENCE
+        target = np.where(np.asarray(confidence, bool)[:, None], measured, 0.0)
+        system = csc_array(diags_array(trust) + stiffness * self._roughness)
+        return splu(system).solve(np.asarray(confidence, float)[:, None] * target)
+
+    def stray(self, values: Float[np.ndarray, "n k"], known: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Distance of each value from the median of its known neighbours and their neighbours; inf if unknown."""
+        distance = np.full(len(values), np.inf)
+        for k in np.nonzero(known)[0]:
+            around = self._neighbours[k]
+            around = around[known[around]]
+            if len(around):
+                distance[k] = np.linalg.norm(values[k] - np.median(values[around], axis=0))
+        return distance
+
+    def jacobian(self, values: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
+        """Derivative of values by first-image pixels, by least squares over each particle's neighbours."""
+        return np.stack([gradient @ values for gradient in self._gradient], axis=-1)
+
+
+def _gradient(uv: Float[np.ndarray, "n 2"], i: np.ndarray, j: np.ndarray) -> tuple[csr_array, csr_array]:
+    """Two sparse matrices that turn values at the particles into their derivatives by u and v.
+
+    Least squares over the neighbours j of i: g_i = (sum_j s s^T)^-1 sum_j s (f_j - f_i), s = uv_j - uv_i.
+    """
+    n, step = len(uv), uv[j] - uv[i]
+    normal = np.zeros((n, 2, 2))
+    np.add.at(normal, i, step[:, :, None] * step[:, None, :])
+    weight = np.einsum("mij,mj->mi", np.linalg.inv(normal)[i], step)
+    return tuple(
+        csr_array((np.concatenate([w, -w]), (np.concatenate([i, i]), np.concatenate([j, i]))), shape=(n, n))
+        for w in weight.T
+    )

@@ -1,0 +1,253 @@
+"""The estimator's own particles: a triangle mesh laid over the first stereo cloud.
+
+Contour samples of the tissue mask, kept a little inside it so that their surroundings are tissue, plus a hexagonal
+lattice, triangulated after Delaunay in the plane that fits the sheet best. Depth comes from a robust low-order
+polynomial surface through the disparity, so a sheet must be smooth at rest. Knows nothing of the reference's mesh.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import Delaunay
+
+from jiggle_mj.camera import StereoCamera
+from jiggle_mj.errors import PerceptionError
+
+FEWEST_PARTICLES = 30
+"""Below this a sheet is too coarse to say anything about where it is attached."""
+SMALLEST_ANGLE = 18.0
+"""Triangles on the rim with a smaller angle are needles and are left out [degrees]."""
+LEAST_MATCHED = 0.2
+"""Share of the tissue's pixels that must have a disparity."""
+MOST_SAMPLES = 20000
+"""Pixels that a surface is fitted to."""
+FINEST_DISPARITY = 0.01
+"""No disparity is known better than this [px]."""
+HIGHEST_DEGREE = 4
+"""Highest degree of the polynomial through the disparity. A plane's disparity is of degree 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageMesh:
+    """A mesh over the first image."""
+
+    uvd: Float[np.ndarray, "n 3"]
+    """Left pixel and disparity of each particle in the first frame [px]."""
+    rest: Float[np.ndarray, "n 3"]
+    """World [m]."""
+    faces: Int[np.ndarray, "f 3"]
+    """Counter-clockwise as the camera sees them."""
+
+
+def lay_mesh(
+    mask: Bool[np.ndarray, "height width"],
+    disparity: Float[np.ndarray, "height width"],
+    camera: StereoCamera,
+    *,
+    spacing: float,
+    inset: float = 0.3,
+) -> ImageMesh:
+    """Particles and triangles over one connected sheet.
+
+    Args:
+        mask: pixels of the sheet.
+        disparity: [px], NaN where unknown.
+        camera: the calibrated pair.
+        spacing: distance between neighbouring particles [m].
+        inset: how far inside the contour its samples lie, in spacings.
+
+    Raises:
+        PerceptionError: no disparity on the tissue, too few particles, or a mesh in several pieces.
+    """
+    surface = surface_through(mask, disparity)
+    rows, columns = np.nonzero(mask)
+    pick = slice(None, None, max(1, len(rows) // MOST_SAMPLES))
+    cloud = camera.back_project(surface(np.stack([columns[pick], rows[pick]], axis=-1).astype(float)))
+    frame = _PlaneFrame(cloud, camera, surface)
+
+    pixel = _pixel_size(cloud, camera)
+    outline = _outline(mask, inset * spacing / pixel, frame)
+    rim = _resample(outline, spacing, tolerance=0.25 * spacing)
+    inner = _lattice(outline, spacing)
+    flat = np.concatenate([rim, inner])
+    if len(flat) < FEWEST_PARTICLES:
+        raise PerceptionError(
+            f"the sheet carries {len(flat)} particles at a spacing of {spacing * 1e3:g} mm, at least "
+            f"{FEWEST_PARTICLES} are needed; move the camera closer or lower the spacing."
+        )
+    flat, faces = _triangulate(flat, outline, spacing)
+    uvd = frame.to_image(flat)
+    return ImageMesh(uvd=uvd, rest=camera.back_project(uvd), faces=faces)
+
+
+class DisparitySurface:
+    """A polynomial d(u, v) through disparities, robust against mismatches.
+
+    Iteratively reweighted least squares with Cauchy weights, their scale from the median absolute residual. The
+    degree is the one with the least Bayesian information criterion, m log(s^2) + k log(m), with s that scale, k
+    coefficients and m samples.
+    """
+
+    def __init__(self, pixels: Float[np.ndarray, "m 2"], disparity: Float[np.ndarray, " m"]):
+        self._middle, self._scale = pixels.mean(axis=0), pixels.std(axis=0).max()
+        fits = [self._fit(pixels, disparity, degree) for degree in range(1, HIGHEST_DEGREE + 1)]
+        self.degree, self._coefficients, _ = min(fits, key=lambda fit: fit[2])
+
+    def __call__(self, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
+        """Pixel and fitted disparity [px]."""
+        disparity = self._basis(pixels, self.degree) @ self._coefficients
+        return np.concatenate([pixels, disparity[:, None]], axis=-1)
+
+    def _basis(self, pixels: Float[np.ndarray, "m 2"], degree: int) -> Float[np.ndarray, "m k"]:
+        x, y = ((pixels - self._middle) / self._scale).T
+        return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
+
+    def _fit(
+        self, pixels: Float[np.ndarray, "m 2"], disparity: Float[np.ndarray, " m"], degree: int
+    ) -> tuple[int, Float[np.ndarray, " k"], float]:
+        """Degree, coefficients and information criterion."""
+        basis, weight = self._basis(pixels, degree), np.ones(len(disparity))
+        for _ in range(10):
+            root = np.sqrt(weight)
+            coefficients = np.linalg.lstsq(basis * root[:, None], disparity * root, rcond=None)[0]
+            residual = disparity - basis @ coefficients
+            scale = max(1.4826 * float(np.median(np.abs(residual))), FINEST_DISPARITY)
+            weight = 1 / (1 + (residual / (2 * scale)) ** 2)
+        criterion = 2 * len(disparity) * np.log(scale) + basis.shape[1] * np.log(len(disparity))
+        return degree, coefficients, float(criterion)
+
+
+def surface_through(
+    mask: Bool[np.ndarray, "height width"], disparity: Float[np.ndarray, "height width"]
+) -> DisparitySurface:
+    """The surface through a dense disparity on the tissue.
+
+    Raises:
+        PerceptionError: fewer than a fifth of the tissue's pixels have a disparity.
+    """
+    rows, columns = np.nonzero(mask & (np.nan_to_num(disparity) > 0))
+    share = len(rows) / max(int(mask.sum()), 1)
+    if share < LEAST_MATCHED:
+        raise PerceptionError(
+            f"only {share:.0%} of the tissue has a positive disparity, at least {LEAST_MATCHED:.0%} is needed: are the "
+            "left and right cameras swapped, the pair not rectified, or the tissue without texture?"
+        )
+    pick = slice(None, None, max(1, len(rows) // MOST_SAMPLES))
+    pixels = np.stack([columns[pick], rows[pick]], axis=-1).astype(float)
+    return DisparitySurface(pixels, disparity[rows[pick], columns[pick]].astype(float))
+
+
+class _PlaneFrame:
+    """Coordinates in the plane that fits the sheet best [m], and the way from there to the image and back."""
+
+    def __init__(self, cloud: Float[np.ndarray, "m 3"], camera: StereoCamera, surface: DisparitySurface):
+        self._camera, self._surface = camera, surface
+        self._origin = np.median(cloud, axis=0)
+        _, _, axes = np.linalg.svd(cloud[:: max(1, len(cloud) // 4000)] - self._origin, full_matrices=False)
+        normal = axes[2] * np.sign(axes[2] @ (camera.T_world_camera[:3, 3] - self._origin))
+        right = camera.T_world_camera[:3, 0]
+        first = right - normal * (normal @ right)
+        first /= np.linalg.norm(first)
+        self._axes = np.stack([first, np.cross(normal, first)])
+
+    def from_image(self, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
+        """Pixels to the plane, through the fitted surface."""
+        return (self._camera.back_project(self._surface(pixels)) - self._origin) @ self._axes.T
+
+    def to_image(self, flat: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
+        """Points of the plane to pixel and disparity, by fixed-point iteration on the surface's height."""
+        guess = flat
+        for _ in range(6):
+            pixels = self._camera.project(self._origin + guess @ self._axes)[:, :2]
+            guess = guess + flat - self.from_image(pixels)
+        return self._surface(self._camera.project(self._origin + guess @ self._axes)[:, :2])
+
+
+def _pixel_size(cloud: Float[np.ndarray, "m 3"], camera: StereoCamera) -> float:
+    """Size of a pixel at the sheet's median depth [m]."""
+    depth = np.median((cloud - camera.T_world_camera[:3, 3]) @ camera.T_world_camera[:3, 2])
+    return float(depth / camera.focal[0])
+
+
+def _outline(mask: Bool[np.ndarray, "height width"], inset: float, frame: _PlaneFrame) -> Float[np.ndarray, "m 2"]:
+    """The sheet's contour, smoothed, `inset` pixels inside the mask, as a closed polygon in the plane [m]."""
+    framed = np.pad(mask.astype(np.uint8), 1)
+    filled = np.zeros_like(framed)
+    contours, _ = cv2.findContours(framed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(filled, [max(contours, key=cv2.contourArea)], -1, 1, cv2.FILLED)
+    depth = cv2.GaussianBlur(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), (0, 0), 1.5)
+    contours, _ = cv2.findContours((depth > inset).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        raise PerceptionError("the tissue is thinner than the mesh's inset from its rim; lower the spacing.")
+    contour = max(contours, key=cv2.contourArea)[:, 0, :].astype(float) - 1
+    return frame.from_image(contour)
+
+
+def _resample(outline: Float[np.ndarray, "m 2"], spacing: float, *, tolerance: float) -> Float[np.ndarray, "k 2"]:
+    """Points along a closed polygon, its corners kept, otherwise about `spacing` apart."""
+    scaled = (outline / tolerance).astype(np.float32)
+    corners = cv2.approxPolyDP(scaled[:, None], 1.0, True)[:, 0]
+    where = np.sort([int(np.argmin(np.sum((scaled - corner) ** 2, axis=1))) for corner in corners])
+    points = []
+    for start, stop in zip(where, np.roll(where, -1), strict=True):
+        index = np.arange(start, stop + 1 if stop > start else stop + len(outline) + 1) % len(outline)
+        part = outline[index]
+        length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(part, axis=0), axis=1))])
+        at = np.linspace(0, length[-1], max(1, round(length[-1] / spacing)) + 1)[:-1]
+        points.append(np.stack([np.interp(at, length, part[:, axis]) for axis in range(2)], axis=-1))
+    points = np.concatenate(points)
+    gap = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
+    return points[gap > 0.5 * spacing]
+
+
+def _lattice(outline: Float[np.ndarray, "m 2"], spacing: float) -> Float[np.ndarray, "k 2"]:
+    """Hexagonal lattice points inside a polygon, at least 0.6 spacings from it."""
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    rise = spacing * np.sqrt(3) / 2
+    n_rows, n_columns = (np.ceil((high - low)[::-1] / (rise, spacing)) + 1).astype(int)
+    row, column = np.mgrid[:n_rows, :n_columns]
+    points = np.stack([column + 0.5 * (row % 2), row], axis=-1).reshape(-1, 2) * (spacing, rise)
+    points += (low + high) / 2 - points.mean(axis=0)
+    return points[_depth_inside(points, outline, spacing) > 0.6 * spacing]
+
+
+def _depth_inside(
+    points: Float[np.ndarray, "k 2"], outline: Float[np.ndarray, "m 2"], unit: float
+) -> Float[np.ndarray, " k"]:
+    """Distance to a polygon [m], negative outside; `unit` [m] sets the scale of the float32 arithmetic."""
+    polygon = (outline / unit).astype(np.float32)[:, None]
+    return unit * np.array([cv2.pointPolygonTest(polygon, (float(x), float(y)), True) for x, y in points / unit])
+
+
+def _triangulate(
+    points: Float[np.ndarray, "n 2"], outline: Float[np.ndarray, "m 2"], spacing: float
+) -> tuple[Float[np.ndarray, "k 2"], Int[np.ndarray, "f 3"]]:
+    """Delaunay triangles inside the outline without needles; particles without a triangle are dropped.
+
+    Raises:
+        PerceptionError: the triangles form several pieces.
+    """
+    faces = Delaunay(points).simplices
+    corner = points[faces]
+    edge = np.roll(corner, -1, axis=1) - corner
+    turn = edge[:, 0, 0] * edge[:, 1, 1] - edge[:, 0, 1] * edge[:, 1, 0]
+    faces[turn < 0] = faces[turn < 0][:, ::-1]
+    length = np.linalg.norm(edge, axis=2)
+    smallest = np.abs(turn) / (length * np.roll(length, -1, axis=1)).max(axis=1)  # sine, between the two longest sides
+    inside = _depth_inside(corner.mean(axis=1), outline, spacing) > 0
+    faces = faces[inside & (smallest > np.sin(np.radians(SMALLEST_ANGLE))) & (length.max(axis=1) < 2.5 * spacing)]
+    used, faces = np.unique(faces, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(used), len(used)))
+    pieces, label = connected_components(graph, directed=False)
+    if pieces > 1:
+        raise PerceptionError(
+            f"the sheet's mesh falls into {pieces} pieces of {np.bincount(label).tolist()} particles; the tissue in "
+            "view must be one connected sheet, wider than two spacings everywhere."
+        )
+    return points[used], faces

@@ -1,0 +1,81 @@
+"""Which pixels are tissue, from appearance alone.
+
+The shipped `WarmTissue` takes soft tissue to be warm (the red-green and blue-yellow axes of CIE L*a*b*; perfused
+tissue is red to yellow, instruments are grey, drapes and beds are green, blue or grey). It splits the warm side by
+Otsu's threshold (Otsu 1979, doi:10.1109/TSMC.1979.4310076). A learned model plugs in through `TissueMask`.
+Does not decide what the sheet is: `largest_blob` does, and refuses two sheets.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from jiggle_mj.errors import PerceptionError
+
+SECOND_BLOB = 0.25
+"""A second blob above this fraction of the largest one's area is a second sheet, not a fleck."""
+
+
+class TissueMask(Protocol):
+    """Anything that says which pixels are tissue."""
+
+    def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Bool[np.ndarray, "height width"]:
+        """Tissue pixels of an RGB image."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class WarmTissue:
+    """Tissue is what is clearly redder than grey and redder than the rest of the image."""
+
+    redness: float = 6.0
+    """Smallest a* (CIE L*a*b*, 8-bit scale around 128) that can be tissue; grey is 0, raw meat about 30."""
+    smoothing: float = 1.5
+    """Standard deviation of the Gaussian that quiets colour noise first [px]."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not self.redness > 0 or not self.smoothing > 0:
+            raise ValueError(
+                f"WarmTissue.redness and .smoothing must be above 0; got {self.redness} and {self.smoothing}."
+            )
+
+    def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Bool[np.ndarray, "height width"]:
+        """Tissue pixels of an RGB image; nothing where the image holds nothing warm."""
+        smooth = cv2.GaussianBlur(image, (0, 0), self.smoothing)
+        a_star = cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB)[..., 1]
+        warmth = np.clip(a_star.astype(np.int16) - 128, 0, 127).astype(np.uint8)
+        otsu, _ = cv2.threshold(warmth, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+        tissue = (warmth > max(otsu, self.redness)).astype(np.uint8)
+        tissue = cv2.morphologyEx(tissue, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        return cv2.morphologyEx(tissue, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)).astype(bool)
+
+
+def largest_blob(mask: Bool[np.ndarray, "height width"], *, smallest: int) -> Bool[np.ndarray, "height width"]:
+    """The one connected sheet of a mask.
+
+    Args:
+        mask: tissue pixels.
+        smallest: fewest pixels that can be a sheet [px].
+
+    Raises:
+        PerceptionError: there is no tissue, or there are two sheets of comparable size.
+    """
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    if not areas.size or areas.max() < smallest:
+        found = int(areas.max()) if areas.size else 0
+        raise PerceptionError(
+            f"no tissue in view: the largest patch of tissue colour has {found} px, at least {smallest} are needed; "
+            "point the camera at the tissue, or pass a mask that knows its colour."
+        )
+    order = np.argsort(-areas, kind="stable")
+    if areas.size > 1 and areas[order[1]] > SECOND_BLOB * areas[order[0]]:
+        raise PerceptionError(
+            f"two disconnected sheets in view ({areas[order[0]]} and {areas[order[1]]} px); one connected sheet is "
+            "tracked: cover the other, or pass a mask that leaves it out."
+        )
+    return labels == order[0] + 1

@@ -1,0 +1,1 @@
+"""The only place where truth meets estimate: carrying, metrics, calibration, tracking, score and the report."""

@@ -1,0 +1,87 @@
+"""Whether the belief's stated uncertainty is honest, against the truth carried to the particles.
+
+The Gaussian before the non-negativity constraint is judged, since that is what the filter propagates. Particles whose
+true stiffness is no number (a weld, or attached by an unknown amount) are marginalised out, which for a Gaussian means
+dropping their rows and columns.
+
+NEES is the normalised estimation error squared of Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to
+Tracking and Navigation" (2001); divided by the degrees of freedom it is 1 on average for an honest belief, above 1 for
+an over-confident one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.special import ndtri
+
+from jiggle_mj.estimate import Belief
+
+LEVEL = 0.90
+"""Probability that the intervals are meant to hold."""
+BINS = 10
+"""Equal bins of probability for the expected calibration error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """None where there is nothing to judge by."""
+
+    nees_per_dof: float | None
+    coverage_90: float | None
+    """Share of particles whose true stiffness lies in the central 90 % interval of its marginal."""
+    ece: float | None
+    """Expected calibration error of the probabilities of being attached."""
+
+
+def nees_per_dof(belief: Belief, stiffness: Float[np.ndarray, " n"]) -> float | None:
+    """(b_hat - b*)^T Sigma^-1 (b_hat - b*) / n over the particles whose b* is finite, in float64.
+
+    Raises:
+        ValueError: the covariance is not positive definite.
+    """
+    known = np.isfinite(stiffness)
+    if not known.any():
+        return None
+    error = belief.mean[known].astype(np.float64) - stiffness[known]
+    covariance = belief.covariance[np.ix_(known, known)].astype(np.float64)
+    try:
+        factor = cho_factor(covariance, lower=True)
+    except LinAlgError as failure:
+        raise ValueError(
+            f"Belief.covariance is not positive definite ({failure}); NEES needs one that is "
+            "(was it kept in float32, or never symmetrised?)."
+        ) from failure
+    return float(error @ cho_solve(factor, error) / known.sum())
+
+
+def coverage(belief: Belief, stiffness: Float[np.ndarray, " n"], level: float = LEVEL) -> float | None:
+    """Share of the particles of finite b* with |b_hat - b*| <= z sd, z the two-sided normal quantile of `level`."""
+    known = np.isfinite(stiffness)
+    if not known.any():
+        return None
+    half_width = ndtri((1 + level) / 2) * np.sqrt(np.diagonal(belief.covariance)[known])
+    return float(np.mean(np.abs(belief.mean[known] - stiffness[known]) <= half_width))
+
+
+def expected_calibration_error(probability: Float[np.ndarray, " n"], attached: Bool[np.ndarray, " n"]) -> float:
+    """Mean over particles of |share attached - mean probability| of the bin that the particle falls into."""
+    bin_of = np.minimum((probability * BINS).astype(int), BINS - 1)
+    surplus = np.bincount(bin_of, weights=attached - probability, minlength=BINS)
+    return float(np.abs(surplus).sum() / len(probability))
+
+
+def calibration(
+    belief: Belief,
+    stiffness: Float[np.ndarray, " n"],
+    attached: Bool[np.ndarray, " n"],
+    *,
+    probability: Float[np.ndarray, " n"] | None = None,
+) -> Calibration:
+    """All three figures; `probability` is that of being attached, None for an estimator that states none."""
+    return Calibration(
+        nees_per_dof=nees_per_dof(belief, stiffness),
+        coverage_90=coverage(belief, stiffness),
+        ece=None if probability is None else expected_calibration_error(probability, attached),
+    )

@@ -1,0 +1,156 @@
+"""The figures of one run, with the keys of `result.json`, and their file.
+
+`result` makes the whole skeleton from what the estimator knows, with null for all that needs the truth; `with_truth`
+fills that in; `score` does it for a folder on disk. Fractions, not per cent; null where undefined.
+
+Not judged yet, and null: which attachments the pulls could show (`n_observable`, `observable`), the limit on the
+boundary energy and its violations, and the expected calibration error, since no rule states probabilities.
+"""
+
+import copy
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jiggle_mj.eval.calibration import calibration
+from jiggle_mj.eval.carrying import carry
+from jiggle_mj.eval.metrics import DILATIONS, agreement, average_precision
+from jiggle_mj.eval.tracking import mean_boundary_energy, tracking
+
+from jiggle_mj.errors import OutputError
+from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.truth import Truth
+
+Json = dict[str, object]
+NO_AGREEMENT = {"pcd": None, "pug": None, "f1": None}
+
+
+def result(
+    *,
+    scene: str,
+    seed: int,
+    sensing: str,
+    estimator: str,
+    policy: str,
+    sheet: Sheet,
+    estimates: Sequence[Estimate],
+    detection: Detection,
+    prior_entropy: float | None,
+    skipped: Sequence[tuple[int, str]] = (),
+    plan_s: float | None = None,
+    simulation_s: float | None = None,
+) -> Json:
+    """All keys of `result.json`, before any truth is seen.
+
+    Args:
+        scene: name of the scene or recording.
+        seed: of the run.
+        sensing: stereo, points or particles.
+        estimator: implicit, explicit or adam.
+        policy: who chose the pulls.
+        sheet: the estimator's particles.
+        estimates: one for each used frame.
+        detection: what is called attached.
+        prior_entropy: of the belief before any frame [nat]; None if not known.
+        skipped: index and reason of each frame that was left out.
+        plan_s: median wall time of choosing one pull [s]; None where nothing was planned.
+        simulation_s: wall time of the reference tissue, all frames [s]; None for a recording.
+    """
+    update = np.array([estimate.update_s for estimate in estimates])
+    perception = np.array([estimate.perception_s for estimate in estimates])
+    return {
+        "scene": scene,
+        "seed": seed,
+        "sensing": sensing,
+        "estimator": estimator,
+        "policy": policy,
+        "n_particles": len(sheet.rest),
+        "n_frames": len(estimates) + len(skipped),
+        "detection": {
+            "rule": detection.rule,
+            "n_detected": int(detection.attached.sum()),
+            "n_attached": None,
+            "n_observable": None,
+            "by_dilation": {str(rings): dict(NO_AGREEMENT) for rings in DILATIONS},
+            "average_precision": None,
+            "observable": {"by_dilation": {str(rings): dict(NO_AGREEMENT) for rings in DILATIONS}},
+        },
+        "calibration": {"nees_per_dof": None, "coverage_90": None, "ece": None},
+        "tracking": {"rms_m": None},
+        "safety": {"limit_j": None, "max_mean_boundary_energy_j": None, "violations": None},
+        "entropy": {
+            "prior": _number(prior_entropy),
+            "final": _number(estimates[-1].entropy) if estimates else None,
+        },
+        "frames": {"used": len(estimates), "skipped": [{"index": index, "why": why} for index, why in skipped]},
+        "timing": {
+            "update_s": {
+                "median": float(np.median(update)) if len(update) else None,
+                "p95": float(np.percentile(update, 95)) if len(update) else None,
+            },
+            "perception_s": float(np.median(perception)) if len(perception) else None,
+            "plan_s": _number(plan_s),
+            "simulation_s": _number(simulation_s),
+        },
+    }
+
+
+def with_truth(
+    unscored: Json,
+    *,
+    sheet: Sheet,
+    estimates: Sequence[Estimate],
+    belief: Belief,
+    detection: Detection,
+    truth: Truth,
+) -> Json:
+    """A copy of `unscored` with all that the truth decides; the truth is that at the last frame the estimator used."""
+    carried = carry(sheet, truth, estimates[-1].index if estimates else 0)
+    agreements = {rings: agreement(detection.attached, carried.attached, sheet.faces, rings) for rings in DILATIONS}
+    judged = calibration(belief, carried.stiffness, carried.attached)
+    scored = copy.deepcopy(unscored)
+    _section(scored, "detection").update(
+        n_detected=int(detection.attached.sum()),
+        n_attached=int(carried.attached.sum()),
+        by_dilation={str(rings): {"pcd": one.pcd, "pug": one.pug, "f1": one.f1} for rings, one in agreements.items()},
+        average_precision=average_precision(detection.score, carried.attached),
+    )
+    _section(scored, "calibration").update(
+        nees_per_dof=judged.nees_per_dof, coverage_90=judged.coverage_90, ece=judged.ece
+    )
+    _section(scored, "tracking").update(rms_m=tracking(sheet, estimates, truth).rms)
+    _section(scored, "safety").update(max_mean_boundary_energy_j=mean_boundary_energy(truth))
+    return scored
+
+
+def write_result(path: Path, figures: Json) -> None:
+    """Write `result.json`; NaN and infinity are refused, as JSON has neither."""
+    path.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+
+
+def read_result(path: Path) -> Json:
+    """Read `result.json`.
+
+    Raises:
+        OutputError: the file is missing or is no JSON object.
+    """
+    try:
+        figures = json.loads(path.read_text())
+    except OSError as failure:
+        raise OutputError(f"{path} cannot be read ({failure.strerror}); 'estimate' or 'run' writes it.") from failure
+    except ValueError as failure:
+        raise OutputError(f"{path} is not JSON ({failure}); estimate the recording again.") from failure
+    if not isinstance(figures, dict) or not isinstance(figures.get("detection"), dict):
+        raise OutputError(f"{path} is JSON but not a result of this program; give the folder that 'estimate' wrote.")
+    return figures
+
+
+def _section(figures: Json, name: str) -> Json:
+    section = figures[name]
+    assert isinstance(section, dict)
+    return section
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)

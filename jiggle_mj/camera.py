@@ -1,0 +1,129 @@
+"""A calibrated stereo camera: pinhole projection, disparity, and the conventions of its frames.
+
+Cameras follow the OpenCV optical convention (x right, y down, z forward); pixel coordinates put integers at pixel
+centres. `T_world_camera` maps points in the left camera's optical frame to the world.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from jiggle_mj.errors import RecordingError
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns an OpenGL camera frame (y up, looking along -z; MuJoCo's) into an optical one, and back: it is its inverse."""
+
+
+def optical_from_opengl(T_world_opengl: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Pose of the optical frame of a camera whose OpenGL pose is given, both camera to world."""
+    return T_world_opengl @ OPENCV_FROM_OPENGL
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraCalibration:
+    """One camera of the pair, with the fields of `sensor_msgs/CameraInfo`."""
+
+    width: int
+    """Image width [px]."""
+    height: int
+    """Image height [px]."""
+    K: Float[np.ndarray, "3 3"]
+    """Intrinsics of the raw image [px]."""
+    P: Float[np.ndarray, "3 4"]
+    """Projection of the rectified image [px]; the right camera has P[0, 3] = -fx * baseline [px m]."""
+    D: Float[np.ndarray, " d"] = field(default_factory=lambda: np.zeros(5))
+    """Distortion, OpenCV's `plumb_bob` order; zeros for a rectified image."""
+    R: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    """Rectifying rotation."""
+
+    @property
+    def rectified(self) -> bool:
+        """Whether the raw image already is the rectified one."""
+        return not self.D.any() and np.allclose(self.R, np.eye(3)) and np.allclose(self.K, self.P[:, :3])
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoCamera:
+    """Two calibrated cameras and where the left one stands.
+
+    Raises:
+        RecordingError: sizes differ, or the right camera's P[0, 3] is not negative (left and right swapped?).
+    """
+
+    left: CameraCalibration
+    right: CameraCalibration
+    T_world_camera: Float[np.ndarray, "4 4"]
+    """Left optical frame to world [m]."""
+
+    def __post_init__(self) -> None:
+        """Check that the two calibrations belong together."""
+        sizes = [(c.width, c.height) for c in (self.left, self.right)]
+        if sizes[0] != sizes[1]:
+            raise RecordingError(
+                f"camera_info sizes differ: left {sizes[0]}, right {sizes[1]}; both must be one rectified size."
+            )
+        if not self.baseline > 0:
+            raise RecordingError(
+                f"right camera_info has P[0,3] = {self.right.P[0, 3]:.6g}; it must be -fx*baseline, below zero "
+                "(are the cameras swapped, or is the calibration monocular?)."
+            )
+
+    @classmethod
+    def rectified(
+        cls, *, width: int, height: int, focal: float, baseline: float, T_world_camera: Float[np.ndarray, "4 4"]
+    ) -> "StereoCamera":
+        """An ideal pair with the principal point in the image's centre; focal in px, baseline in m."""
+        K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+        left, right = np.hstack([K, np.zeros((3, 1))]), np.hstack([K, [[-focal * baseline], [0], [0]]])
+        return cls(
+            left=CameraCalibration(width=width, height=height, K=K, P=left),
+            right=CameraCalibration(width=width, height=height, K=K, P=right),
+            T_world_camera=T_world_camera,
+        )
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """Rectified focal lengths fx, fy [px]."""
+        return float(self.left.P[0, 0]), float(self.left.P[1, 1])
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Rectified principal point cx, cy [px]."""
+        return float(self.left.P[0, 2]), float(self.left.P[1, 2])
+
+    @property
+    def baseline(self) -> float:
+        """Distance between the two centres of projection [m]."""
+        return float(-self.right.P[0, 3] / self.right.P[0, 0])
+
+    def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """World points [m] to left pixel u, v and disparity [px] (u_left - u_right, positive in front)."""
+        T = np.linalg.inv(self.T_world_camera)
+        camera = points @ T[:3, :3].T + T[:3, 3]
+        (fx, fy), (cx, cy), depth = self.focal, self.centre, camera[..., 2]
+        return np.stack(
+            [fx * camera[..., 0] / depth + cx, fy * camera[..., 1] / depth + cy, fx * self.baseline / depth], axis=-1
+        )
+
+    def back_project(self, uvd: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Left pixel u, v and disparity [px] to world points [m]: the inverse of `project`."""
+        (fx, fy), (cx, cy) = self.focal, self.centre
+        depth = fx * self.baseline / uvd[..., 2]
+        camera = np.stack([(uvd[..., 0] - cx) * depth / fx, (uvd[..., 1] - cy) * depth / fy, depth], axis=-1)
+        return camera @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
+
+    def back_projection_jacobian(self, uvd: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+        """Derivative of `back_project` [m/px], for carrying pixel noise into the world."""
+        (fx, fy), (cx, cy) = self.focal, self.centre
+        u, v, d = np.moveaxis(uvd, -1, 0)
+        depth, zero = fx * self.baseline / d, np.zeros_like(d)
+        jacobian = np.stack(
+            [
+                np.stack([depth / fx, zero, -(u - cx) * depth / (fx * d)], axis=-1),
+                np.stack([zero, depth / fy, -(v - cy) * depth / (fy * d)], axis=-1),
+                np.stack([zero, zero, -depth / d], axis=-1),
+            ],
+            axis=-2,
+        )
+        return self.T_world_camera[:3, :3] @ jacobian

@@ -1,0 +1,36 @@
+"""What can go wrong with data and environment, each named so that a caller can tell them apart.
+
+Wrong arguments raise `ValueError`; everything here is a `JiggleError`, which the command line prints as one line.
+"""
+
+
+class JiggleError(Exception):
+    """Base of the errors that a user can mend: the message says what was given, what is allowed, what to do."""
+
+
+class SceneError(JiggleError):
+    """A scene file is missing, malformed or describes something impossible."""
+
+
+class RecordingError(JiggleError):
+    """A recording or a folder of measured data is missing, malformed, foreign or holds truth."""
+
+
+class PerceptionError(JiggleError):
+    """The images cannot be used: no tissue in view, cameras swapped, sizes that differ."""
+
+
+class MeshError(JiggleError):
+    """A mesh is degenerate, inverted or in several pieces."""
+
+
+class RenderError(JiggleError):
+    """No offscreen OpenGL on this machine."""
+
+
+class SimulationError(JiggleError):
+    """The reference simulation became unstable; the message names the dumped state."""
+
+
+class OutputError(JiggleError):
+    """An output path already holds results or cannot be written."""

@@ -1,0 +1,149 @@
+"""What crosses between the tissue and the estimator: observations one way, actions the other.
+
+An `Observation` is all that the estimator ever sees. World frame: z up, SI units, times in integer nanoseconds from 0.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from jiggle_mj.errors import RecordingError
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoPair:
+    """One raw image from each camera, taken at the same time.
+
+    Raises:
+        RecordingError: the two sizes differ.
+    """
+
+    left: UInt8[np.ndarray, "height width 3"]
+    """RGB."""
+    right: UInt8[np.ndarray, "height width 3"]
+    """RGB."""
+
+    def __post_init__(self) -> None:
+        """Check that the two images have one size."""
+        if self.left.shape != self.right.shape:
+            raise RecordingError(f"stereo images differ in size: left {self.left.shape}, right {self.right.shape}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredPoints:
+    """Points measured on the tissue, instead of images or beside them."""
+
+    positions: Float[np.ndarray, "m 3"]
+    """World [m]; NaN rows are points that were not seen."""
+    track_id: Int[np.ndarray, " m"] | None = None
+    """The same number means the same material point in every frame; None for clouds without correspondence."""
+    sd: float = 2e-4
+    """Stated standard deviation of each coordinate [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToolState:
+    """The tweezer as the robot reports it."""
+
+    position: Float[np.ndarray, " 3"]
+    """Tip, world [m]."""
+    quat_wxyz: Float[np.ndarray, " 4"]
+    """Orientation, world."""
+    closed: bool
+    """Whether the jaws hold the tissue."""
+    grasp: int
+    """Number of the current or last grasp, counted from 1; 0 before the first."""
+    radius: float
+    """Particles within this distance of the tip when the jaws close are held [m]."""
+    held_tracks: tuple[int, ...] = ()
+    """Track ids known to be held, for recordings that declare them; empty means 'by radius'."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """One moment: the tool, and images or measured points or both."""
+
+    index: int
+    """Position in the recording, skipped frames counted."""
+    time: int
+    """Time from the recording's start [ns]."""
+    tool: ToolState
+    images: StereoPair | None = None
+    points: MeasuredPoints | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeclaredMesh:
+    """A mesh that the user declares for imported data; its vertices may reach beyond what is seen."""
+
+    vertices: Float[np.ndarray, "n 3"]
+    """Rest positions [m]."""
+    faces: Int[np.ndarray, "f 3"]
+    track_id: Int[np.ndarray, " n"]
+    """Track id of the measured point at each vertex, -1 where nothing is measured."""
+    held: Bool[np.ndarray, " n"] | None = None
+    """Vertices known to be in the grip, where the tool's radius cannot say; None for 'by radius'."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Declaration:
+    """What the user says is known of the tissue before anything is seen. Not truth: it may be wrong.
+
+    Positions alone give stiffness ratios only; `membrane_stiffness` is what turns them into N/m.
+    """
+
+    membrane_stiffness: float = 30.0
+    """Young's modulus times thickness [N/m]."""
+    poisson: float = 0.45
+    thickness: float = 1e-3
+    """[m]; with the membrane stiffness it gives the bending stiffness."""
+    areal_density: float = 1.0
+    """Mass per area [kg/m^2]."""
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    """[m/s^2], world; zeros where nobody knows which way is down."""
+    bed: bool = True
+    """Whether the tissue lies on a bed at rest, which it cannot pass."""
+    mesh: DeclaredMesh | None = None
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("membrane_stiffness", "thickness", "areal_density"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"Declaration.{name} must be above 0; got {getattr(self, name)}.")
+        if not 0 <= self.poisson < 0.5:
+            raise ValueError(
+                f"Declaration.poisson must be in [0, 0.5) for a shell; got {self.poisson} "
+                "(use 0.49 for nearly incompressible tissue)."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grasp:
+    """Close the jaws at a point."""
+
+    point: Float[np.ndarray, " 3"]
+    """World [m]."""
+    radius: float
+    """[m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Release:
+    """Open the jaws and let the tissue settle."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Move:
+    """Move the tip, and settle."""
+
+    to: Float[np.ndarray, " 3"]
+    """World [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wait:
+    """Observe once more without acting: still frames, from which noise is learned."""
+
+
+Action = Grasp | Release | Move | Wait

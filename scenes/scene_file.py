@@ -1,0 +1,101 @@
+"""Scene files: one TOML table per section, read strictly.
+
+Unknown keys, wrong types and missing files are refused with the key, the value and what is allowed.
+"""
+
+import tomllib
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+from jiggle_mj.errors import SceneError
+from jiggle_mj.scenes.attachments import SHAPES, Attachment
+from jiggle_mj.scenes.scene import (
+    Bed,
+    Camera,
+    Declared,
+    Lights,
+    Programme,
+    Scene,
+    Sensing,
+    Texture,
+    Tissue,
+    Tweezer,
+)
+from jiggle_mj.scenes.section import Section
+
+SECTIONS: dict[str, type[Section]] = {
+    cls.section: cls for cls in (Tissue, Bed, Tweezer, Programme, Camera, Lights, Texture, Sensing, Declared)
+}
+FOLDER = Path(__file__).parent
+
+
+def shipped_scenes() -> tuple[str, ...]:
+    """Names of the scenes that come with the package."""
+    return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
+
+
+def load_scene(name_or_path: str | Path) -> Scene:
+    """Read a shipped scene by its name, or a scene file by its path.
+
+    Raises:
+        SceneError: no such scene, not TOML, or a key or value that is not allowed.
+    """
+    path = Path(name_or_path)
+    if str(name_or_path) in shipped_scenes():
+        path = FOLDER / f"{name_or_path}.toml"
+    elif path.suffix != ".toml":
+        raise SceneError(
+            f"no scene named {str(name_or_path)!r}; shipped scenes are {', '.join(shipped_scenes())}, "
+            "and the path of a scene file ends in .toml."
+        )
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"cannot read the scene file {path}: {error}.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{path} is not valid TOML: {error}.") from None
+    return scene_from_table(table, name=path.stem)
+
+
+def scene_from_table(table: dict[str, Any], *, name: str) -> Scene:
+    """Build a scene from parsed TOML."""
+    known = ["seed", "attachments", *SECTIONS]
+    _refuse_unknown(table, known, where="the scene")
+    seed = table.get("seed", 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise SceneError(f"seed = {seed!r}: must be a whole number in [0, 2^32).")
+    attachments = table.get("attachments", [])
+    if not isinstance(attachments, list):
+        raise SceneError(f"attachments = {attachments!r}: must be an array of tables, each headed [[attachments]].")
+    sections = {key: _section(cls, table[key], where=key) for key, cls in SECTIONS.items() if key in table}
+    shapes = tuple(_attachment(entry, where=f"attachments[{i}]") for i, entry in enumerate(attachments))
+    return Scene(name=name, seed=seed, attachments=shapes, **sections)  # type: ignore[arg-type]
+
+
+def _attachment(table: object, *, where: str) -> Attachment:
+    if not isinstance(table, dict):
+        raise SceneError(f"{where} = {table!r}: must be a table headed [[attachments]].")
+    shape = table.get("shape")
+    if shape not in SHAPES:
+        raise SceneError(f"{where}.shape = {shape!r}: must be one of {', '.join(map(repr, SHAPES))}.")
+    return _section(SHAPES[shape], {k: v for k, v in table.items() if k != "shape"}, where=where)
+
+
+def _section(cls: type[Section], table: object, *, where: str) -> Any:
+    if not isinstance(table, dict):
+        raise SceneError(f"{where} = {table!r}: must be a table.")
+    _refuse_unknown(table, [f.name for f in fields(cls)], where=where)
+    missing = [f.name for f in fields(cls) if f.default is MISSING and f.name not in table]
+    if missing:
+        raise SceneError(f"{where} lacks {', '.join(missing)}.")
+    try:
+        return cls(**table)
+    except SceneError as error:
+        raise SceneError(str(error).replace(f"{cls.section}.", f"{where}.", 1)) from None
+
+
+def _refuse_unknown(table: dict[str, Any], known: list[str], *, where: str) -> None:
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise SceneError(f"unknown key {unknown[0]!r} in {where}; known keys are {', '.join(known)}.")

@@ -1,0 +1,161 @@
+"""Checked fields of a scene: every key has a type and an allowed range, in TOML and in Python alike.
+
+A `Section` is a frozen dataclass whose fields are made by `number`, `integer`, `switch`, `choice`, `vector` and
+`points`; construction checks them and raises a `SceneError` that names the key, the value and what is allowed.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any, ClassVar
+
+from jiggle_mj.errors import SceneError
+
+Check = Callable[[object], Any]
+"""Returns the value in its stored type, or raises ValueError with what is allowed."""
+
+
+def _real(value: object, allowed: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(allowed)
+    return float(value)
+
+
+def _field(check: Check, default: object) -> Any:
+    return field(default=default, metadata={"check": check})
+
+
+def _interval(above: float | None, at_least: float | None, at_most: float | None, below: float | None) -> str:
+    low = f"({above:g}" if above is not None else f"[{at_least:g}" if at_least is not None else "(-inf"
+    high = f"{below:g})" if below is not None else f"{at_most:g}]" if at_most is not None else "inf)"
+    return f"{low}, {high}"
+
+
+def number(
+    default: float | object = MISSING,
+    *,
+    unit: str = "",
+    above: float | None = None,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    below: float | None = None,
+) -> Any:
+    """A finite number in an interval; without a default the key is required."""
+    allowed = f"a number in {_interval(above, at_least, at_most, below)}{f' {unit}' if unit else ''}"
+
+    def check(value: object) -> float:
+        real = _real(value, allowed)
+        outside = (
+            (above is not None and real <= above)
+            or (at_least is not None and real < at_least)
+            or (at_most is not None and real > at_most)
+            or (below is not None and real >= below)
+        )
+        if outside:
+            raise ValueError(allowed)
+        return real
+
+    return _field(check, default)
+
+
+def integer(default: int | object = MISSING, *, at_least: int, at_most: int) -> Any:
+    """A whole number in an interval."""
+    allowed = f"a whole number in [{at_least}, {at_most}]"
+
+    def check(value: object) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or not at_least <= value <= at_most:
+            raise ValueError(allowed)
+        return value
+
+    return _field(check, default)
+
+
+def switch(default: bool | object = MISSING) -> Any:
+    """True or false."""
+
+    def check(value: object) -> bool:
+        if not isinstance(value, bool):
+            raise ValueError("true or false")
+        return value
+
+    return _field(check, default)
+
+
+def choice(default: str | object = MISSING, *, among: tuple[str, ...]) -> Any:
+    """One of a few words."""
+
+    def check(value: object) -> str:
+        if not isinstance(value, str) or value not in among:
+            raise ValueError("one of " + ", ".join(repr(word) for word in among))
+        return value
+
+    return _field(check, default)
+
+
+def vector(
+    default: tuple[float, ...] | object = MISSING, *, length: int, unit: str = "", above: float | None = None
+) -> Any:
+    """A list of `length` finite numbers, each above a bound where one is given."""
+    bound = f" above {above:g}" if above is not None else ""
+    allowed = f"a list of {length} numbers{bound}{f' {unit}' if unit else ''}"
+
+    def check(value: object) -> tuple[float, ...]:
+        if not isinstance(value, list | tuple) or len(value) != length:
+            raise ValueError(allowed)
+        reals = tuple(_real(entry, allowed) for entry in value)
+        if above is not None and min(reals) <= above:
+            raise ValueError(allowed)
+        return reals
+
+    return _field(check, default)
+
+
+def points(default: tuple[tuple[float, float], ...] | object = MISSING, *, at_least: int) -> Any:
+    """A list of points x, y."""
+    allowed = f"a list of at least {at_least} points [x, y] in m"
+
+    def check(value: object) -> tuple[tuple[float, ...], ...]:
+        if not isinstance(value, list | tuple) or len(value) < at_least:
+            raise ValueError(allowed)
+        if any(not isinstance(point, list | tuple) or len(point) != 2 for point in value):
+            raise ValueError(allowed)
+        return tuple(tuple(_real(entry, allowed) for entry in point) for point in value)
+
+    return _field(check, default)
+
+
+def stiffness() -> Any:
+    """A spring constant per vertex, or a weld, which is stored as infinity."""
+    allowed = "a number above 0 in N/m per vertex, or 'weld'"
+
+    def check(value: object) -> float:
+        if value == "weld" or value == math.inf:
+            return math.inf
+        real = _real(value, allowed)
+        if real <= 0:
+            raise ValueError(allowed)
+        return real
+
+    return _field(check, MISSING)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """One table of a scene file.
+
+    Raises:
+        SceneError: a value has the wrong type or is out of its range.
+    """
+
+    section: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        """Check every field and store it in its type."""
+        for f in fields(self):
+            if "check" not in f.metadata:
+                continue
+            value = getattr(self, f.name)
+            try:
+                object.__setattr__(self, f.name, f.metadata["check"](value))
+            except ValueError as error:
+                raise SceneError(f"{self.section}.{f.name} = {value!r}: must be {error}.") from None

@@ -1,0 +1,172 @@
+"""Imports run one way: cli, eval, episode, then scenes or estimator, then the vocabulary that both sides share.
+
+Read from the sources, imports inside functions included, because no static tool follows the mapping of the root's
+folders onto `jiggle_mj.*`. A module may import the modules of its own layer and those that `ALLOWED` lists for it.
+"""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FOLDERS = {"jiggle_mj": "jiggle_mj", "scenes": "jiggle_mj.scenes", "estimator": "jiggle_mj.estimator",
+           "eval": "jiggle_mj.eval"}  # fmt: skip
+"""Folder at the root to import name, as in pyproject.toml."""
+
+LAYER = {
+    "jiggle_mj": "names",
+    "jiggle_mj.cli": "cli",
+    "jiggle_mj.__main__": "cli",
+    "jiggle_mj.eval": "eval",
+    "jiggle_mj.episode": "episode",
+    "jiggle_mj.importing": "episode",
+    "jiggle_mj.scenes": "scenes",
+    "jiggle_mj.estimator": "estimator",
+    "jiggle_mj.truth": "truth",
+    "jiggle_mj.truth_recording": "truth",
+    "jiggle_mj.recording": "files",
+    "jiggle_mj.doctor": "doctor",
+}
+"""The layer of a module is that of its longest prefix here; the rest of jiggle_mj is the shared vocabulary."""
+
+ALLOWED = {
+    "cli": {"names", "eval", "episode", "scenes", "estimator", "truth", "files", "doctor", "vocabulary"},
+    "eval": {"names", "episode", "scenes", "estimator", "truth", "files", "vocabulary"},
+    "episode": {"scenes", "estimator", "truth", "files", "vocabulary"},
+    "scenes": {"truth", "vocabulary"},
+    "estimator": {"vocabulary"},
+    "files": {"vocabulary"},
+    "truth": {"files", "vocabulary"},
+    "doctor": {"vocabulary"},
+    "vocabulary": set(),
+    "names": {"cli", "eval", "episode", "scenes", "estimator", "files", "doctor", "vocabulary"},
+}
+"""What each layer may import beside itself. `names` is `jiggle_mj/__init__.py`, which offers the public names lazily."""
+
+FORBIDDEN = {
+    "estimator": {"mujoco", "mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "tomllib"},
+    "scenes": {"jax", "equinox"},
+    "vocabulary": {"mujoco", "jax", "equinox", "cv2", "mcap"},
+}
+"""Packages that a layer must not touch: the estimator sees neither MuJoCo's state nor a file."""
+
+FILE_READERS = {"open", "read_text", "read_bytes", "load", "loadtxt", "genfromtxt", "fromfile", "imread", "memmap"}
+"""Calls that read a file; the estimator makes none."""
+
+
+def modules(root: Path) -> dict[str, Path]:
+    """Import name to source file, over the four folders."""
+    found = {}
+    for folder, package in FOLDERS.items():
+        for path in sorted((root / folder).rglob("*.py")):
+            parts = path.relative_to(root / folder).with_suffix("").parts
+            found[".".join([package, *(part for part in parts if part != "__init__")])] = path
+    return found
+
+
+def imports(path: Path, name: str) -> Iterator[tuple[int, str]]:
+    """Line and absolute name of all that a module imports; `from a import b` gives a.b."""
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*parents, *([node.module] if node.module else [])])
+            yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in {"import_module", "importlib.import_module"}:
+            yield from ((node.lineno, a.value) for a in node.args[:1] if isinstance(a, ast.Constant))
+
+
+def layer(name: str) -> str:
+    """The layer of a module, or of a name imported from one."""
+    if name == "jiggle_mj" or name.startswith("jiggle_mj.__version__"):
+        return "names"
+    prefixes = [p for p in LAYER if p != "jiggle_mj" and (name == p or name.startswith(p + "."))]
+    return LAYER[max(prefixes, key=len)] if prefixes else "vocabulary"
+
+
+def broken_rules(root: Path) -> list[str]:
+    """Every import, and every reading of a file, that breaks the directions."""
+    found = []
+    for name, path in modules(root).items():
+        own = layer(name)
+        for line, target in imports(path, name):
+            place = f"{path.relative_to(root)}:{line}: {name}"
+            if target.split(".")[0] == "jiggle_mj":
+                if layer(target) not in ALLOWED[own] | {own}:
+                    found.append(f"{place} ({own}) imports {target} ({layer(target)})")
+            elif target.split(".")[0] in FORBIDDEN.get(own, ()):
+                found.append(f"{place} ({own}) imports {target}")
+        if own == "estimator":
+            found += [f"{path.relative_to(root)}:{line}: {call}() reads a file" for line, call in file_reads(path)]
+    return found
+
+
+def file_reads(path: Path) -> Iterator[tuple[int, str]]:
+    """Calls by which a module would read a file."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if called.rpartition(".")[2] in FILE_READERS:
+                yield node.lineno, called
+
+
+def test_imports_run_one_way():
+    assert broken_rules(ROOT) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        ("estimator/belief.py", "import mujoco"),
+        ("estimator/belief.py", "from jiggle_mj.scenes import tissue"),
+        ("estimator/belief.py", "from jiggle_mj import truth"),
+        ("estimator/belief.py", "from jiggle_mj.recording import ObservationReader"),
+        ("estimator/belief.py", "def f():\n    from jiggle_mj.truth_recording import read_truth"),
+        ("estimator/belief.py", "import numpy as np\nx = np.load('a.npy')"),
+        ("estimator/perception/flow.py", "from ...scenes import tissue"),
+        ("estimator/perception/flow.py", "from .. import eval, belief\nfrom jiggle_mj import eval"),
+        ("scenes/tissue.py", "from jiggle_mj.estimator.mesh import lattice"),
+        ("scenes/tissue.py", "import jax.numpy as jnp"),
+        ("scenes/tissue.py", "import jiggle_mj.eval.metrics"),
+        ("jiggle_mj/camera.py", "from jiggle_mj.estimator import mesh"),
+        ("jiggle_mj/observation.py", "from jiggle_mj.truth import Truth"),
+        ("jiggle_mj/recording.py", "from jiggle_mj.truth import Truth"),
+        ("jiggle_mj/episode.py", "from jiggle_mj.eval import metrics"),
+        ("eval/metrics.py", "from jiggle_mj.cli import main"),
+    ],
+)
+def test_a_wrong_import_is_found(tmp_path: Path, module: str, line: str):
+    """The same check over a tree that holds nothing but one wrong line names that line's file, once."""
+    wrong = tmp_path / module
+    wrong.parent.mkdir(parents=True)
+    wrong.write_text(line + "\n", encoding="utf-8")
+    assert [message.split(":")[0] for message in broken_rules(tmp_path)] == [module]
+
+
+def loaded_by(statement: str) -> set[str]:
+    """Top-level packages in a fresh interpreter after a statement."""
+    code = f"{statement}\nimport sys\nprint(*{{name.split('.')[0] for name in sys.modules}})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_importing_the_package_is_light():
+    """Neither numerics, simulator nor images until a name is used."""
+    assert not loaded_by("import jiggle_mj") & {"jax", "mujoco", "cv2", "scipy", "plotly", "mcap", "equinox"}
+
+
+def test_importing_the_estimator_leaves_mujoco_out():
+    """Every module of it, not only its front."""
+    names = [name for name in modules(ROOT) if name.startswith("jiggle_mj.estimator")]
+    assert "mujoco" not in loaded_by("import " + ", ".join(names))
+
+
+def test_importing_the_scenes_leaves_jax_out():
+    names = [name for name in modules(ROOT) if name.startswith("jiggle_mj.scenes")]
+    assert "jax" not in loaded_by("import " + ", ".join(names))
