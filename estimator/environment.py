@@ -127,3 +127,34 @@ class Grip(Term):
         across = jnp.maximum(1 - self.length / distance, 0)[:, None, None]
         window = along + across * (jnp.eye(3, dtype=x.dtype) - along)
         return (self.stiffness[:, None, None] * window)[:, None, :, None, :]
+
+
+class Tether(Term):
+    """Springs from the particles to given points: 1/2 (x - to)^T K (x - to)."""
+
+    vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
+    to: Float[Array, "n 3"]
+    """[m]."""
+    stiffness: Float[Array, "n 3 3"]
+    """Symmetric, zero for 'none' [N/m]."""
+
+    @classmethod
+    def build(cls, to: Float[np.ndarray, "n 3"]) -> "Tether":
+        """Slack springs, to be set later."""
+        return cls(vertices=np.arange(len(to))[:, None], to=jnp.asarray(to), stiffness=jnp.zeros((len(to), 3, 3)))
+
+    def energy(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
+        """[J]."""
+        return 0.5 * jnp.sum(self.gradient(x)[:, 0] * (x[:, 0] - self.to), axis=1)
+
+    def gradient(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3"]:
+        """[N]."""
+        return jnp.einsum("nij,nj->ni", self.stiffness, x[:, 0] - self.to)[:, None]
+
+    def hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
+        """[N/m]."""
+        return self.stiffness[:, None, :, None, :]
+
+    def positive_hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
+        """The Hessian, which is semi-definite already."""
+        return self.hessian(x)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from trimesh.triangles import closest_point, points_to_barycentric
 
 from jiggle_mj.estimate import Sheet
@@ -64,7 +64,7 @@ def carry(sheet: Sheet, truth: Truth, index: int) -> CarriedTruth:
 
     A reference without triangles has no areas: its stiffness is taken over unscaled.
     """
-    nearest = cKDTree(truth.rest).query(sheet.rest)[1]
+    nearest = np.asarray(KDTree(truth.rest).query(sheet.rest)[1])
     stiffness = stiffness_at(truth, frame_at(truth, index))[nearest]
     attached = np.isnan(stiffness) | (stiffness > 0)
     if len(truth.faces):
@@ -82,7 +82,7 @@ def barycentric_weights(
     Weights are in [0, 1] and sum to 1. A mesh without triangles gives the nearest vertex.
     """
     if not len(faces):
-        nearest = cKDTree(vertices).query(points)[1]
+        nearest = np.asarray(KDTree(vertices).query(points)[1])
         return np.repeat(nearest[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(points), 1))
     triangles = vertices[faces]
     chosen, weights = np.empty(len(points), dtype=int), np.empty((len(points), 3))

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 DILATIONS = (0, 1, 2)
 """Rings reported, as in the paper."""
@@ -120,7 +120,7 @@ def distances(origin: Float[np.ndarray, "a 3"], target: Float[np.ndarray, "b 3"]
     """Mean and 95th percentile of the distance from each origin to its nearest target [m]."""
     if not len(origin) or not len(target):
         return Distances(mean=None, percentile_95=None)
-    each = cKDTree(target).query(origin)[0]
+    each = KDTree(target).query(origin)[0]
     return Distances(mean=float(each.mean()), percentile_95=float(np.percentile(each, 95)))
 
 

@@ -18,9 +18,11 @@ from jiggle_mj.eval.carrying import carry
 from jiggle_mj.eval.metrics import DILATIONS, agreement, average_precision
 from jiggle_mj.eval.tracking import mean_boundary_energy, tracking
 
-from jiggle_mj.errors import OutputError
+from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.estimate_recording import read_estimate
 from jiggle_mj.truth import Truth
+from jiggle_mj.truth_recording import read_truth
 
 Json = dict[str, object]
 NO_AGREEMENT = {"pcd": None, "pug": None, "f1": None}
@@ -122,6 +124,34 @@ def with_truth(
     _section(scored, "tracking").update(rms_m=tracking(sheet, estimates, truth).rms)
     _section(scored, "safety").update(max_mean_boundary_energy_j=mean_boundary_energy(truth))
     return scored
+
+
+def score(directory: Path, truth_path: Path) -> Json:
+    """Score DIR/estimate.mcap against a truth file, and write the figures into DIR/result.json.
+
+    All that `result.json` said before and the truth does not decide, above all the timing, is kept.
+
+    Raises:
+        OutputError: DIR has no readable `result.json`, or its estimate did not finish.
+        RecordingError: a file is missing, damaged or of the wrong kind, or the truth is of another recording.
+    """
+    unscored = read_result(directory / "result.json")
+    recording = read_estimate(directory / "estimate.mcap")
+    if recording.belief is None or recording.detection is None:
+        raise OutputError(f"{directory / 'estimate.mcap'} ends before its belief; estimate the recording again.")
+    truth = read_truth(truth_path)
+    if truth.frames and not {f.index for f in truth.frames} & {e.index for e in recording.estimates}:
+        raise RecordingError(f"{truth_path} shares no frame with {directory}; give the truth of the same recording.")
+    figures = with_truth(
+        unscored,
+        sheet=recording.sheet,
+        estimates=recording.estimates,
+        belief=recording.belief,
+        detection=recording.detection,
+        truth=truth,
+    )
+    write_result(directory / "result.json", figures)
+    return figures
 
 
 def write_result(path: Path, figures: Json) -> None:

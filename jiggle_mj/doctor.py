@@ -205,7 +205,5 @@ def _memory() -> Check:
         name="memory",
         ok=ok,
         detail=f"{found / 1e9:.1f} GB",
-        remedy=""
-        if ok
-        else f"Runs may need {MINIMUM_MEMORY / 1e9:.0f} GB; close other programs or use a larger machine.",
+        remedy="" if ok else f"A run may need {MINIMUM_MEMORY / 1e9:.0f} GB.",
     )

@@ -162,10 +162,11 @@ def _whole_length(file: BinaryIO) -> tuple[int, bool]:
         opcode, length = struct.unpack("<BQ", file.read(9))
         if offset + 9 + length > size:
             break
-        offset += 9 + length
         if opcode == Opcode.FOOTER:
-            file.seek(offset)
-            return offset + len(MCAP0_MAGIC), file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+            end = offset + 9 + length + len(MCAP0_MAGIC)
+            file.seek(end - len(MCAP0_MAGIC))
+            return (end, True) if file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC else (offset, False)
+        offset += 9 + length
     return offset, False
 
 

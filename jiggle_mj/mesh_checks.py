@@ -4,7 +4,7 @@ Checks connectivity and area only: neither self-intersection nor the quality of 
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -14,12 +14,12 @@ MINIMUM_RELATIVE_AREA = 1e-6
 """Twice a triangle's area over its longest edge squared, below which it has no usable normal in float32."""
 
 
-def check_mesh(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+def check_mesh(vertices: Shaped[np.ndarray, "..."], faces: Shaped[np.ndarray, "..."]) -> None:
     """Refuse a mesh that is not one consistently oriented sheet of triangles with area.
 
     Args:
-        vertices: positions [m].
-        faces: vertex numbers of each triangle, counted from 0.
+        vertices: positions [m], to be of shape (n, 3).
+        faces: vertex numbers of each triangle, counted from 0, to be integers of shape (f, 3).
 
     Raises:
         MeshError: no triangles, wrong shapes, vertices that are not finite, vertex numbers out of range, a vertex
@@ -33,10 +33,10 @@ def check_mesh(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
         raise MeshError(f"mesh faces must be integers of shape (f, 3); got {faces.dtype} {faces.shape}.")
     if len(faces) == 0:
         raise MeshError("the mesh has no triangles.")
+    _check_indices(len(vertices), faces)
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise MeshError(f"mesh vertex {bad} is not finite: {vertices[bad].tolist()}; leave unseen vertices out.")
-    _check_indices(len(vertices), faces)
     _check_areas(vertices, faces)
     _check_orientation(faces)
     _check_one_piece(len(vertices), faces)

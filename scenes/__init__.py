@@ -4,17 +4,12 @@
     with Reference(scene, seed=0, sensing="stereo") as reference:
         for action in programme(scene):
             observation = reference.step(action)
-
-MuJoCo reads MUJOCO_GL when it is imported, so the offscreen default is set here, before any module imports it.
 """
 
-import os
+from jiggle_mj.scenes import opengl as opengl  # before anything that imports mujoco
+from jiggle_mj.scenes.programme import programme
+from jiggle_mj.scenes.reference import Reference
+from jiggle_mj.scenes.scene import Scene
+from jiggle_mj.scenes.scene_file import load_scene, scene_table, shipped_scenes
 
-os.environ.setdefault("MUJOCO_GL", "egl")
-
-from jiggle_mj.scenes.programme import programme  # noqa: E402
-from jiggle_mj.scenes.reference import Reference  # noqa: E402
-from jiggle_mj.scenes.scene import Scene  # noqa: E402
-from jiggle_mj.scenes.scene_file import load_scene, shipped_scenes  # noqa: E402
-
-__all__ = ["Reference", "Scene", "load_scene", "programme", "shipped_scenes"]
+__all__ = ["Reference", "Scene", "load_scene", "programme", "scene_table", "shipped_scenes"]

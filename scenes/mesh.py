@@ -9,14 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
 from jiggle_mj.errors import MeshError
+from jiggle_mj.mesh_checks import check_mesh
 
 JITTER = 0.22
 """Largest displacement of an inner vertex of the unstructured mesh, in edge lengths."""
+MINIMUM_HEIGHT = 0.1
+"""Smallest height of a triangle over its longest edge; needles make the shell's stiffness ill-conditioned."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,37 +73,24 @@ def build_sheet(*, size: tuple[float, float], spacing: float, kind: str, seed: i
 
 
 def check_sheet(vertices: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"]) -> None:
-    """Refuse a mesh that no shell can be made of.
+    """Refuse a mesh that MuJoCo cannot make a shell of: `check_mesh`, and no slender or upside-down triangles.
 
     Raises:
-        MeshError: a triangle names a missing vertex, has no area or is inverted, an edge belongs to more than two
-            triangles, a vertex to none, or the sheet falls into pieces.
+        MeshError: naming the first triangle at fault.
     """
-    n = len(vertices)
-    if not np.isfinite(vertices).all():
-        raise MeshError(f"vertex {int(np.argwhere(~np.isfinite(vertices))[0, 0])} is not finite.")
-    if faces.size == 0 or faces.min() < 0 or faces.max() >= n:
-        raise MeshError(f"triangles must name vertices 0 to {n - 1}; got {len(faces)} triangles outside that range.")
+    check_mesh(np.column_stack([vertices, np.zeros(len(vertices))]), faces)
     areas = triangle_areas(vertices, faces)
-    longest = np.max([np.linalg.norm(vertices[faces[:, k]] - vertices[faces[:, k - 1]], axis=1) for k in range(3)], 0)
-    flat = np.flatnonzero(np.abs(areas) <= 1e-3 * longest**2)
-    if flat.size:
-        raise MeshError(
-            f"{flat.size} degenerate triangles, the first is {flat[0]} with vertices {faces[flat[0]].tolist()} and area "
-            f"{areas[flat[0]]:.3g} m^2: merge its vertices or move them apart."
-        )
     inverted = np.flatnonzero(areas < 0)
     if inverted.size:
         raise MeshError(
             f"{inverted.size} inverted triangles, the first is {inverted[0]} with vertices "
             f"{faces[inverted[0]].tolist()}: list the vertices counter-clockwise seen from above."
         )
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    if count.max() > 2:
-        raise MeshError(f"edge {unique[count.argmax()].tolist()} belongs to {count.max()} triangles; at most 2 can meet.")
-    graph = coo_matrix((np.ones(len(unique)), unique.T), shape=(n, n))
-    pieces, label = connected_components(graph, directed=False)
-    if pieces > 1:
-        sizes = np.bincount(label).tolist()
-        raise MeshError(f"the sheet is in {pieces} pieces of {sizes} vertices; it must be one connected piece.")
+    edges = np.stack([vertices[faces[:, k]] - vertices[faces[:, k - 1]] for k in range(3)])
+    height = 2 * areas / np.linalg.norm(edges, axis=2).max(axis=0) ** 2
+    if height.min() < MINIMUM_HEIGHT:
+        worst = int(height.argmin())
+        raise MeshError(
+            f"triangle {worst} with vertices {faces[worst].tolist()} is degenerate: its height is {height[worst]:.3g} "
+            f"of its longest edge, at least {MINIMUM_HEIGHT} is needed; merge its vertices or move them apart."
+        )

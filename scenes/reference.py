@@ -5,7 +5,6 @@ state but the tool's pose and what the chosen sensing shows.
 """
 
 import math
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
@@ -15,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jiggle_mj.camera import StereoCamera
-from jiggle_mj.errors import SceneError
 from jiggle_mj.observation import Action, Declaration, Grasp, Move, Observation, Release, ToolState, Wait
 from jiggle_mj.scenes import sensing as sense
 from jiggle_mj.scenes.scene import Scene
+from jiggle_mj.scenes.scene_file import scene_table
 from jiggle_mj.scenes.simulation import check_state, settle
 from jiggle_mj.scenes.stereo import StereoRenderer, stereo_camera
 from jiggle_mj.scenes.tissue import PARKED, TIMESTEP, build_tissue
@@ -68,6 +67,7 @@ class Reference:
         self._renderer = StereoRenderer(self._tissue.model, scene.camera) if sensing == "stereo" else None
         self._set_jaws(OPEN_ANGLE)
         self._settle()
+        self._data.time = 0.0
         self._rest = self._surface()
         self._frames: list[TruthFrame] = []
 
@@ -85,7 +85,7 @@ class Reference:
         """Carry out an action, let the tissue settle, and observe.
 
         Raises:
-            ValueError: a grasp off the tissue or while grasping, a release of nothing.
+            ValueError: a grasp off the tissue or while grasping, a release of nothing, numbers that are not finite.
             SimulationError: the tissue became unstable.
         """
         match action:
@@ -94,7 +94,7 @@ class Reference:
             case Release():
                 self._open()
             case Move():
-                self._move(np.asarray(action.to, dtype=float))
+                self._move(_finite(action.to, name="Move.to"))
             case Wait():
                 pass
         self._index += 1
@@ -118,7 +118,7 @@ class Reference:
             attached=self._tissue.stiffness > 0,
             frames=tuple(self._frames),
             scene=self.scene.name,
-            details={"scene": asdict(self.scene)},
+            details={"scene": scene_table(self.scene), "capped": list(self.capped)},
         )
 
     def close(self) -> None:
@@ -155,7 +155,9 @@ class Reference:
     def _close(self, action: Grasp) -> None:
         if self._closed:
             raise ValueError(f"grasp at {_text(action.point)} while grasp {self._grasp} still holds: release it first.")
-        point = np.asarray(action.point, dtype=float)
+        point = _finite(action.point, name="Grasp.point")
+        if not (math.isfinite(action.radius) and action.radius > 0):
+            raise ValueError(f"Grasp.radius must be above 0 m; got {action.radius}.")
         vertices = self._surface()
         distance = np.linalg.norm(vertices - point, axis=1)
         inside = np.flatnonzero(distance <= action.radius)
@@ -246,6 +248,13 @@ class Reference:
             grasp=self._grasp,
             radius=self._radius,
         )
+
+
+def _finite(point: Float[np.ndarray, " 3"], *, name: str) -> Float[np.ndarray, " 3"]:
+    values = np.array(point, dtype=float)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise ValueError(f"{name} must be three finite numbers in m; got {point}.")
+    return values
 
 
 def _text(point: Float[np.ndarray, " 3"]) -> str:

@@ -54,8 +54,8 @@ class Tweezer(Section):
     section: ClassVar[str] = "tweezer"
     radius: float = number(7e-3, unit="m", above=0, at_most=0.05)
     """Vertices within this distance of the tip are held when the jaws close [m]."""
-    speed: float = number(0.05, unit="m/s", above=0, at_most=1)
-    """Of the tip [m/s]."""
+    speed: float = number(0.15, unit="m/s", above=0, at_most=1)
+    """Of the tip while it holds tissue [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,11 +88,11 @@ class Camera(Section):
     baseline: float = number(5e-3, unit="m", above=0, at_most=0.5)
     distance: float = number(0.14, unit="m", above=0, at_most=5)
     """From the pair's middle to the target [m]."""
-    target: tuple[float, float, float] = vector((0.0, 0.006, 0.01), length=3, unit="m")
+    target: tuple[float, float, float] = vector((0.0, 0.004, 0.01), length=3, unit="m")
     """What the pair's middle axis passes through, world [m]."""
     tilt_deg: float = number(15.0, unit="degrees", at_least=-80, at_most=80)
     """0 looks straight down; positive looks from the side of negative y."""
-    fov_deg: float = number(54.0, unit="degrees", above=0, below=170)
+    fov_deg: float = number(50.0, unit="degrees", above=0, below=170)
     """Vertical field of view."""
 
 
@@ -180,3 +180,10 @@ class Scene:
                 f"tissue.spacing = {self.tissue.spacing}: must be at most a quarter of the shorter side, "
                 f"{min(self.tissue.size) / 4:g} m."
             )
+        half = tuple(side / 2 for side in self.tissue.size)
+        for x, y in self.programme.points:
+            if abs(x) > half[0] or abs(y) > half[1]:
+                raise SceneError(
+                    f"programme.points holds ({x:g}, {y:g}), off the tissue: |x| can be at most {half[0]:g} m, "
+                    f"|y| at most {half[1]:g} m."
+                )

@@ -3,6 +3,7 @@
 Unknown keys, wrong types and missing files are refused with the key, the value and what is allowed.
 """
 
+import math
 import tomllib
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -22,7 +23,7 @@ from jiggle_mj.scenes.scene import (
     Tissue,
     Tweezer,
 )
-from jiggle_mj.scenes.section import Section
+from jiggle_mj.scenes.section import Section, checked
 
 SECTIONS: dict[str, type[Section]] = {
     cls.section: cls for cls in (Tissue, Bed, Tweezer, Programme, Camera, Lights, Texture, Sensing, Declared)
@@ -90,7 +91,7 @@ def _section(cls: type[Section], table: object, *, where: str) -> Any:
     if missing:
         raise SceneError(f"{where} lacks {', '.join(missing)}.")
     try:
-        return cls(**table)
+        return cls(**{f.name: checked(f, table[f.name], where=where) for f in fields(cls) if f.name in table})
     except SceneError as error:
         raise SceneError(str(error).replace(f"{cls.section}.", f"{where}.", 1)) from None
 
@@ -99,3 +100,19 @@ def _refuse_unknown(table: dict[str, Any], known: list[str], *, where: str) -> N
     unknown = [key for key in table if key not in known]
     if unknown:
         raise SceneError(f"unknown key {unknown[0]!r} in {where}; known keys are {', '.join(known)}.")
+
+
+def scene_table(scene: Scene) -> dict[str, Any]:
+    """The scene as a table that could stand in a scene file; every key is written out."""
+    table: dict[str, Any] = {"seed": scene.seed}
+    shape_names = {cls: shape for shape, cls in SHAPES.items()}
+    table["attachments"] = [
+        {"shape": shape_names[type(shape)], **_plain(shape)} for shape in scene.attachments
+    ]
+    return table | {key: _plain(getattr(scene, key)) for key in SECTIONS}
+
+
+def _plain(section: Section) -> dict[str, Any]:
+    return {
+        f.name: "weld" if getattr(section, f.name) == math.inf else getattr(section, f.name) for f in fields(section)
+    }

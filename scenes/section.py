@@ -6,7 +6,7 @@ A `Section` is a frozen dataclass whose fields are made by `number`, `integer`, 
 
 import math
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, ClassVar
 
 from jiggle_mj.errors import SceneError
@@ -152,10 +152,16 @@ class Section:
     def __post_init__(self) -> None:
         """Check every field and store it in its type."""
         for f in fields(self):
-            if "check" not in f.metadata:
-                continue
-            value = getattr(self, f.name)
-            try:
-                object.__setattr__(self, f.name, f.metadata["check"](value))
-            except ValueError as error:
-                raise SceneError(f"{self.section}.{f.name} = {value!r}: must be {error}.") from None
+            object.__setattr__(self, f.name, checked(f, getattr(self, f.name), where=self.section))
+
+
+def checked(f: Field[Any], value: object, *, where: str) -> Any:
+    """The value of one field in its stored type.
+
+    Raises:
+        SceneError: it has the wrong type or is out of its range.
+    """
+    try:
+        return f.metadata["check"](value)
+    except ValueError as error:
+        raise SceneError(f"{where}.{f.name} = {value!r}: must be {error}.") from None

@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from jiggle_mj.camera import StereoCamera, optical_from_opengl
 from jiggle_mj.errors import RenderError
 from jiggle_mj.observation import StereoPair
+from jiggle_mj.scenes.opengl import IMPORT_ERROR, no_opengl
 from jiggle_mj.scenes.scene import Camera
 
 NAMES = ("left", "right")
@@ -58,10 +59,12 @@ class StereoRenderer:
     """
 
     def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
+        if IMPORT_ERROR is not None:
+            raise RenderError(no_opengl(IMPORT_ERROR))
         try:
             self._renderer = mujoco.Renderer(model, camera.height, camera.width)
         except Exception as error:
-            raise RenderError(_no_opengl(error)) from error
+            raise RenderError(no_opengl(error)) from error
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._renderer.scene.flags[flag] = 0
 
@@ -78,16 +81,3 @@ class StereoRenderer:
         """Free the OpenGL context."""
         self._renderer.close()
 
-
-def _no_opengl(error: Exception) -> str:
-    return (
-        f"No offscreen OpenGL: MUJOCO_GL={mujoco_gl()} failed ({error}). Install libegl1 libgl1-mesa-dri, or set "
-        "MUJOCO_GL=osmesa with libosmesa6; see 'jiggle-mj doctor'."
-    )
-
-
-def mujoco_gl() -> str:
-    """The OpenGL backend that MuJoCo was asked for."""
-    import os
-
-    return os.environ.get("MUJOCO_GL", "")

@@ -93,8 +93,8 @@ def _set_options(spec: mujoco.MjSpec, scene: Scene) -> None:
     spec.option.solver = mujoco.mjtSolver.mjSOL_CG
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.timestep = TIMESTEP
-    spec.option.iterations = 50
-    spec.option.tolerance = 1e-8
+    spec.option.iterations = 200
+    spec.option.tolerance = 1e-7
     spec.visual.quality.shadowsize = 0
     spec.visual.quality.offsamples = 0
     spec.visual.global_.offwidth = scene.camera.width

@@ -1,4 +1,4 @@
-"""Settings that every test shares: offscreen OpenGL, JAX on the CPU in float64, no silent rank promotion.
+"""Settings that every test shares: offscreen OpenGL, JAX on the CPU in float64, shapes and types checked at each call.
 
 The environment is set before mujoco or jax is imported, which is when they read it.
 """
@@ -11,9 +11,18 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 import itertools
 from collections.abc import Callable
 
+import beartype.typing  # noqa: F401  # named in CHECKER
 import jax
+import jaxtyping
 import pytest
 
+CHECKER = (
+    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True, "
+    "hint_overrides=beartype.FrozenDict({beartype.typing.Self: object})))"
+)
+"""An int is a float, as type checkers have it; Self is unknown to beartype in a method that is decorated on its own."""
+
+jaxtyping.install_import_hook("jiggle_mj", CHECKER)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 

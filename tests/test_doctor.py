@@ -3,13 +3,19 @@
 import os
 import sys
 
+import numpy
 import pytest
 
 from jiggle_mj import doctor
 
 
-def test_every_check_that_fails_carries_a_remedy_and_every_subject_is_covered():
-    checks = doctor.doctor()
+@pytest.fixture(scope="module")
+def checks() -> list[doctor.Check]:
+    """What the doctor says of this machine."""
+    return doctor.doctor()
+
+
+def test_every_check_that_fails_carries_a_remedy_and_every_subject_is_covered(checks: list[doctor.Check]):
     names = [check.name for check in checks]
     assert {"python", *doctor.PACKAGES, "jax devices", "cores", "memory"} <= set(names)
     assert [name for name in names if "OpenGL" in name] == ["offscreen OpenGL, egl", "offscreen OpenGL, osmesa"]
@@ -20,10 +26,8 @@ def test_every_check_that_fails_carries_a_remedy_and_every_subject_is_covered():
         assert "\n" not in check.detail + check.remedy
 
 
-def test_versions_are_those_of_this_environment():
-    details = {check.name: check.detail for check in doctor.doctor()}
-    import numpy
-
+def test_versions_are_those_of_this_environment(checks: list[doctor.Check]):
+    details = {check.name: check.detail for check in checks}
     assert details["numpy"] == numpy.__version__
     assert details["python"] == ".".join(map(str, sys.version_info[:3]))
 
@@ -49,7 +53,9 @@ def test_versions_compare_by_number(found: str, numbers: tuple[int, ...]):
 
 @pytest.mark.render
 def test_a_frame_renders_offscreen():
-    assert doctor.render_failure(backend(), time_limit=60.0) is None
+    """With the driver that the other tests render with."""
+    backend = os.environ["MUJOCO_GL"]
+    assert doctor.render_failure(backend, time_limit=60.0) is None  # pyright: ignore[reportArgumentType]
 
 
 def test_a_driver_that_does_not_answer_is_given_up():
@@ -75,8 +81,3 @@ def test_jax_without_a_usable_platform_is_reported(monkeypatch: pytest.MonkeyPat
     check = doctor._jax()
     assert not check.ok
     assert "no_such_platform" in check.detail and "JAX_PLATFORMS=cpu" in check.remedy
-
-
-def backend():
-    """The driver that this run of the tests uses."""
-    return os.environ["MUJOCO_GL"]

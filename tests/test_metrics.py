@@ -1,5 +1,7 @@
 """Detection figures, the carrying of truth and the tracking error, each against an example worked by hand."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -130,7 +132,7 @@ sets = st.lists(st.booleans(), min_size=10, max_size=10).map(lambda each: np.arr
 def test_dilation_never_lowers_a_figure(detected, attached):
     """dilate(T) contains T, so PCD and PUG are non-decreasing in the number of rings."""
     figures = [agreement(detected, attached, STRIP, rings) for rings in range(3)]
-    for before, after in zip(figures, figures[1:], strict=False):
+    for before, after in itertools.pairwise(figures):
         for name in ("pcd", "pug", "f1"):
             low, high = getattr(before, name), getattr(after, name)
             assert (low is None) == (high is None)
@@ -204,7 +206,9 @@ def test_tracking_rms_is_over_seen_particles_at_interpolated_truth():
     true = particles + [0, 0, 1] * particles[:, [0]]
     observed = true + np.array([[0.003, 0, 0], [0, 0, 0.004], [np.nan] * 3])
     sheet = Sheet(rest=particles, faces=np.array([[0, 1, 2]]))
-    one = tracking(sheet, [estimate_of(true + [0, 0.001, 0], observed)], truth_of(rest, faces, np.zeros(4), moved))
+    one = tracking(
+        sheet, [estimate_of(true + np.array([0, 0.001, 0]), observed)], truth_of(rest, faces, np.zeros(4), moved)
+    )
     assert one.rms == pytest.approx(np.sqrt(12.5e-6))
     assert one.rms_estimate == pytest.approx(0.001)
     assert one.per_frame == pytest.approx([one.rms])
@@ -213,7 +217,7 @@ def test_tracking_rms_is_over_seen_particles_at_interpolated_truth():
 def test_boundary_energy_is_the_mean_over_all_vertices():
     """Two of four vertices at 2 N/m moved by 10 mm: 2 * 1/2 * 2 * 1e-4 J over 4 vertices = 5e-5 J; a weld adds none."""
     rest, faces = lattice(2, 1.0)
-    moved = rest + [0.0, 0.0, 0.01]
+    moved = rest + np.array([0, 0, 0.01])
     assert mean_boundary_energy(truth_of(rest, faces, [2, 2, 0, 0], moved)) == pytest.approx(5e-5)
     assert mean_boundary_energy(truth_of(rest, faces, [2, 2, np.inf, 0], moved)) == pytest.approx(5e-5)
     assert mean_boundary_energy(truth_of(rest, faces, [np.nan, 0, 0, 0], moved)) is None

@@ -14,9 +14,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-if sys.version_info < (3, 11):
-    sys.exit("jiggle-mj needs Python 3.11 or newer; this is %d.%d (try 'make PYTHON=python3.11 ...')."
-             % sys.version_info[:2])  # fmt: skip  # an older Python must be able to read this line
+if sys.version_info < (3, 11):  # noqa: UP036  # whoever runs this may have any Python 3
+    found = "{}.{}".format(*sys.version_info[:2])
+    sys.exit("jiggle-mj needs Python 3.11 or newer; " + found + " was given (try 'make PYTHON=python3.11 ...').")
 
 ROOT = Path(__file__).resolve().parent.parent
 VENV_PACKAGE = f"python{sys.version_info.major}.{sys.version_info.minor}-venv"
@@ -97,7 +97,8 @@ def render_failure(python: Path, backend: str) -> str | None:
 def set_up_opengl(python: Path) -> None:
     """Install a software driver where nothing renders offscreen."""
     backend = os.environ.get("MUJOCO_GL") or "egl"
-    if (failure := render_failure(python, backend)) is None:
+    failure = render_failure(python, backend)
+    if failure is None:
         return
     say(f"no offscreen OpenGL yet ({failure})")
     code = f"from jiggle_mj.doctor import OPENGL_PACKAGES; print(*OPENGL_PACKAGES.get({backend!r}, ()))"
@@ -105,7 +106,8 @@ def set_up_opengl(python: Path) -> None:
     if not packages:
         sys.exit(f"set-up: MUJOCO_GL={backend} does not render on this machine; unset it to use egl.")
     install_packages(packages, "offscreen OpenGL")
-    if failure := render_failure(python, backend):
+    failure = render_failure(python, backend)
+    if failure:
         sys.exit(f"set-up: MUJOCO_GL={backend} does not render, with {' '.join(packages)} installed: {failure}")
 
 

@@ -3,7 +3,7 @@
     y = x + n_y,  n_y ~ N(0, R)         observed positions, a 3x3 block a particle, no row for a missing one
     grad U(x; b) = n_f,  n_f ~ N(0, tau^2 I)    what the model gets wrong, in newtons; no row for a held particle
 
-Gauss-Newton on (x, b) from the observed state. With H the Hessian of U, D = blkdiag(x_i - a_i), W = tau^-2 (0 where held),
+Gauss-Newton on (x, b), from the equilibrium of the sheet tethered to what was observed. With H the Hessian of U, D = blkdiag(x_i - a_i), W = tau^-2 (0 where held),
 A = R^-1 + H W H and N^-1 = W - W H A^-1 H W, eliminating x leaves for b the evidence D^T N^-1 D; each frame enters once.
 Linear in b at the observed state, so the wild response of a free sheet at b = 0 is never needed. The equilibrium condition
 as an implicit measurement follows the errors-in-variables form of the Gauss-Helmert model [Foerstner & Wrobel 2016,
@@ -19,7 +19,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.block_tridiagonal import (
     BlockCholesky,
-    BlockTridiagonal,
     Layout,
     add_to_diagonal,
     assemble,
@@ -28,6 +27,8 @@ from jiggle_mj.estimator.block_tridiagonal import (
     solve_lower,
 )
 from jiggle_mj.estimator.energy import SheetEnergy
+from jiggle_mj.estimator.environment import Tether
+from jiggle_mj.estimator.equilibrium import equilibrium
 from jiggle_mj.estimator.mesh import SheetMesh, pattern
 
 
@@ -58,6 +59,8 @@ class ImplicitFilter(eqx.Module):
     """The filter for one sheet."""
 
     energy: SheetEnergy
+    tethered: SheetEnergy
+    """The same, with springs to the observed positions as its last term."""
     neighbours: Int[Array, "n p"]
     """Particles coupled to each, itself included, padded with n."""
     slots: tuple[Int[Array, "m p p"], ...]
@@ -67,14 +70,16 @@ class ImplicitFilter(eqx.Module):
     places: Int[Array, "n p p"]
     force_sd: Float[Array, ""]
     """tau [N]."""
+    grip_stiffness: Float[Array, ""]
+    """Stiffness of the tethers of held particles [N/m]."""
     state_steps: int = eqx.field(static=True)
     joint_steps: int = eqx.field(static=True)
 
     @classmethod
     def build(
-        cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, state_steps: int = 6, joint_steps: int = 2
+        cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, grip_stiffness: float, state_steps: int = 20, joint_steps: int = 2
     ) -> "ImplicitFilter":
-        """Prepare the index tables for a mesh and its energy."""
+        """Prepare the index tables for a mesh and its energy; force_sd [N], grip_stiffness [N/m]."""
         near = mesh.adjacency.tocsr()
         near.sort_indices()
         degree = np.diff(near.indptr)
@@ -91,11 +96,13 @@ class ImplicitFilter(eqx.Module):
         layout = Layout.from_pattern(pattern(mesh.n, np.column_stack([two_rings.row, two_rings.col])))
         return cls(
             energy=energy,
+            tethered=SheetEnergy.build(mesh.rest, (*energy.terms, Tether.build(mesh.rest)), energy.layout),
             neighbours=jnp.asarray(np.where(neighbours < 0, mesh.n, neighbours)),
             slots=slots,
             layout=layout,
             places=jnp.asarray(layout.pair_index(neighbours)),
             force_sd=jnp.asarray(force_sd, dtype=float),
+            grip_stiffness=jnp.asarray(grip_stiffness, dtype=float),
             state_steps=state_steps,
             joint_steps=joint_steps,
         )
@@ -113,11 +120,9 @@ class ImplicitFilter(eqx.Module):
             x = x + self._state_step(frame, evidence, new_b - b)
             b = new_b
         weight = self._force_weight(evidence)
-        g = self.energy.gradient(x, b)
         squares = 2 * self._cost(x, b, evidence)
         observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
         degrees = observed + 3 * jnp.sum(weight > 0) - 3 * len(x)
-        del g
         return Update(belief=updated, x=x, b=b, nis=squares / jnp.maximum(degrees, 1))
 
     def _force_weight(self, evidence: Evidence) -> Float[Array, " n"]:
@@ -130,22 +135,20 @@ class ImplicitFilter(eqx.Module):
         return 0.5 * (seen + jnp.sum(self._force_weight(evidence) * force))
 
     def _settle(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
-        """State-only Levenberg-Marquardt steps at fixed b [Nocedal & Wright 2006, sec. 10.3]."""
+        """Equilibrium at fixed b of the sheet tethered to the observed positions.
 
-        def step(_, state):  # noqa: ANN001, ANN202
-            x, cost, damping = state
-            frame = self._linearise(x, b, evidence, damping)
-            new = x + self._state_step(frame, evidence, jnp.zeros_like(b))
-            new_cost = self._cost(new, b, evidence)
-            better = new_cost < cost
-            damping = jnp.where(better, damping / 10, damping * 10)
-            return jnp.where(better, new, x), jnp.where(better, new_cost, cost), damping
-
-        first = (x, self._cost(x, b, evidence), jnp.asarray(1.0, x.dtype))
-        return jax.lax.fori_loop(0, self.state_steps, step, first)[0]
+        A tether pulls with tau when a particle is one standard deviation off, so that the outcome nearly balances
+        forces and nearly fits, where the raw observation would be crumpled by its noise far outside the linear range.
+        """
+        sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), 1e-12))
+        pull = (self.force_sd * sd)[:, None, None] * evidence.precision
+        stiff = self.grip_stiffness * jnp.eye(3, dtype=x.dtype)
+        pull = jnp.where(evidence.held[:, None, None], stiff, pull)
+        tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
+        return equilibrium(tethered, b, x, force_tolerance=self.force_sd / 40, max_steps=self.state_steps).x
 
     def _linearise(
-        self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence, damping: float | Array = 0.0
+        self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence
     ) -> "_Frame":
         n, width = self.neighbours.shape
         rows = jnp.zeros((n * width, 3, 3), x.dtype)
@@ -158,8 +161,7 @@ class ImplicitFilter(eqx.Module):
         weight = self._force_weight(evidence)
         squares = jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows)
         matrix = assemble(self.layout, [(self.places, squares)])
-        ground = evidence.precision + (FAINT + damping / PERTURBATION**2) * jnp.eye(3)
-        matrix = add_to_diagonal(self.layout, matrix, ground)
+        matrix = add_to_diagonal(self.layout, matrix, evidence.precision + FAINT * jnp.eye(3))
         return _Frame(
             x=x,
             d=x - self.energy.rest,
@@ -218,5 +220,5 @@ class _Frame(eqx.Module):
     off: Float[Array, "n 3"]
 
 
-FAINT = 1e-2**-2 * 1e-4
-PERTURBATION = 2e-3
+FAINT = 1.0
+"""Precision that keeps unseen, slack particles solvable: a standard deviation of 1 m [1/m^2]."""

@@ -6,13 +6,14 @@ left to right and right to left; what the two do not agree on is unknown. It loc
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 
+@runtime_checkable
 class Disparity(Protocol):
     """Anything that matches a rectified pair."""
 
@@ -59,7 +60,7 @@ class SemiGlobalMatching:
     def _match(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """SGBM with room on the left, so that the image's border is searched too; below 0 where unknown [px]."""
         pad = self.largest
-        matcher = cv2.StereoSGBM_create(
+        matcher = cv2.StereoSGBM.create(
             minDisparity=0,
             numDisparities=self.largest,
             blockSize=self.block,

@@ -17,9 +17,9 @@ def dense_flow(
 ) -> tuple[Float[np.ndarray, "height width 2"], Bool[np.ndarray, "height width"]]:
     """Flow from the first image to the second [px], and where it comes back to its start."""
     grey = [np.clip(image, 0, 255).astype(np.uint8) for image in (first, second)]
-    method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    forward = method.calc(grey[0], grey[1], None)
-    backward = method.calc(grey[1], grey[0], None)
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    forward = method.calc(grey[0], grey[1], np.zeros((*first.shape, 2), np.float32))
+    backward = method.calc(grey[1], grey[0], np.zeros((*first.shape, 2), np.float32))
     rows, columns = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
     back = cv2.remap(backward, columns + forward[..., 0], rows + forward[..., 1], cv2.INTER_LINEAR)
     gap = forward + back

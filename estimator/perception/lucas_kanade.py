@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-
 from jiggle_mj.estimator.perception.material_map import MaterialMap
 
 CONTRAST_FLOOR = 1.5
@@ -34,6 +33,8 @@ class Step:
     """By how much the second image must be sampled further on [material px]; 0 where nothing can be solved."""
     information: Float[np.ndarray, "n k k"]
     """Windowed, weighted gradient products per unit of normalised intensity [1/px^2]."""
+    agreement: Float[np.ndarray, " n"]
+    """Share of the window, of what both images know, that looks alike: 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +45,8 @@ class Match:
     """Windowed, robust RMS residual, of normalised images."""
     correlation: Float[np.ndarray, " n"]
     """Windowed correlation, -1 to 1; -1 where less than a fifth of the window is known in both images."""
+    share: Float[np.ndarray, " n"]
+    """Share of the window that is known in both images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,13 +60,17 @@ class Normalised:
     """1 where the image is known, 0 elsewhere; float32."""
 
 
-def normalise(image: Float[np.ndarray, "h w"], support: Bool[np.ndarray, "h w"], *, window: float) -> Normalised:
-    """Divide by the local standard deviation after taking off the local mean, both within the support."""
+def normalise(image: Float[np.ndarray, "h w"], support: Bool[np.ndarray, "h w"], *, width: int) -> Normalised:
+    """Take off the local mean and divide by the local standard deviation, in a square `width` px wide."""
+
+    def mean_around(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        return cv2.boxFilter(values, cv2.CV_32F, (width, width), borderType=cv2.BORDER_CONSTANT)
+
     known = support.astype(np.float32)
-    share = blur(known, window) + np.float32(1e-6)
+    share = mean_around(known) + np.float32(1e-6)
     clean = np.where(support, image, np.float32(0))
-    mean = blur(clean, window) / share
-    square = blur(clean * clean, window) / share
+    mean = mean_around(clean) / share
+    square = mean_around(clean * clean) / share
     deviation = np.sqrt(np.maximum(square - mean * mean, 0)) + np.float32(CONTRAST_FLOOR)
     image = np.where(support, (clean - mean) / deviation, np.float32(0))
     return Normalised(image=image, deviation=deviation, support=known)
@@ -74,7 +81,10 @@ def step_in_plane(first: Normalised, second: Normalised, material: MaterialMap, 
     weight, residual = _weight(first, second)
     gx, gy = gradients((first.image + second.image) / 2)
     wgx, wgy = weight * gx, weight * gy
-    sums = [material.sample(blur(product, window)) for product in (wgx * gx, wgx * gy, wgy * gy, wgx * residual, wgy * residual)]
+    sums = [
+        material.sample(blur(product, window))
+        for product in (wgx * gx, wgx * gy, wgy * gy, wgx * residual, wgy * residual)
+    ]
     xx, xy, yy, rx, ry = (total.astype(float) for total in sums)
     information = np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
     trace, determinant = xx + yy, xx * yy - xy * xy
@@ -82,7 +92,11 @@ def step_in_plane(first: Normalised, second: Normalised, material: MaterialMap, 
     solvable = smallest > LEAST_GRADIENT
     safe = np.where(solvable, determinant, 1)
     shift = np.stack([yy * rx - xy * ry, xx * ry - xy * rx], axis=-1) / safe[:, None]
-    return Step(shift=np.where(solvable[:, None], shift, 0), information=information)
+    return Step(
+        shift=np.where(solvable[:, None], shift, 0),
+        information=information,
+        agreement=_agreement(first, second, weight, material, window),
+    )
 
 
 def step_along(
@@ -94,7 +108,11 @@ def step_along(
     gg, gr = (material.sample(blur(product, window)).astype(float) for product in (wg * gradient, wg * residual))
     solvable = gg > LEAST_GRADIENT
     shift = np.where(solvable, gr / np.where(solvable, gg, 1), 0)
-    return Step(shift=shift[:, None], information=gg[:, None, None])
+    return Step(
+        shift=shift[:, None],
+        information=gg[:, None, None],
+        agreement=_agreement(first, second, weight, material, window),
+    )
 
 
 def match(first: Normalised, second: Normalised, material: MaterialMap, *, window: float) -> Match:
@@ -108,7 +126,7 @@ def match(first: Normalised, second: Normalised, material: MaterialMap, *, windo
     a, b, aa, bb, ab = (total / share for total in sums[1:6])
     spread = np.maximum(aa - a * a, 1e-6) * np.maximum(bb - b * b, 1e-6)
     correlation = np.where(share > LEAST_SHARE, (ab - a * b) / np.sqrt(spread), -1.0)
-    return Match(noise=np.sqrt(np.maximum(sums[7] / mass, 0)), correlation=correlation)
+    return Match(noise=np.sqrt(np.maximum(sums[7] / mass, 0)), correlation=correlation, share=sums[0])
 
 
 def blur(image: Float[np.ndarray, "h w"], window: float) -> Float[np.ndarray, "h w"]:
@@ -126,3 +144,10 @@ def _weight(first: Normalised, second: Normalised) -> tuple[np.ndarray, np.ndarr
     residual = first.image - second.image
     weight = first.support * second.support / (1 + (residual / np.float32(ROBUST_SCALE)) ** 2)
     return weight, residual
+
+
+def _agreement(
+    first: Normalised, second: Normalised, weight: Float[np.ndarray, "h w"], material: MaterialMap, window: float
+) -> Float[np.ndarray, " n"]:
+    share = material.sample(blur(first.support * second.support, window)).astype(float)
+    return material.sample(blur(weight, window)) / np.maximum(share, 1e-6)

@@ -46,7 +46,9 @@ class MaterialMap:
         owner = np.zeros(self.shape, np.int32)
         for face, corners in enumerate(self.at[faces], start=1):
             cv2.fillConvexPoly(owner, np.round(corners * 16).astype(np.int32), face, shift=4)
-        distance, nearest = distance_transform_edt(owner == 0, return_indices=True)
+        distance = np.empty(self.shape)
+        nearest = np.empty((2, *self.shape), np.int32)
+        distance_transform_edt(owner == 0, return_indices=True, distances=distance, indices=nearest)
         owner = owner[nearest[0], nearest[1]] - 1
         whole = cv2.erode(np.pad(tissue, 1).astype(np.uint8), np.ones((3, 3), np.uint8), iterations=RIM)[1:-1, 1:-1]
         self.support = whole.astype(bool)[self.region] & (distance < reach)

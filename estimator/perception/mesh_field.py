@@ -6,7 +6,7 @@ values linearly, and follows them where they are trusted. Knows nothing of image
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array, csc_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 LEAST_CONFIDENCE = 1e-6
@@ -25,7 +25,10 @@ class MeshField:
         self._mean = diags_array(1 / degree) @ adjacency
         laplacian = diags_array(np.ones(n)) - self._mean
         self._roughness = csc_array(laplacian.T @ laplacian)
-        self._neighbours = [adjacency.indices[adjacency.indptr[k] : adjacency.indptr[k + 1]] for k in range(n)]
+        self._neighbours = np.full((n, int(degree.max())), -1)
+        place = np.arange(len(adjacency.indices)) - np.repeat(adjacency.indptr[:-1], np.diff(adjacency.indptr))
+        self._neighbours[np.repeat(np.arange(n), np.diff(adjacency.indptr)), place] = adjacency.indices
+        self._uv = uv
         self._gradient = _gradient(uv, i, j)
 
     def fill(
@@ -39,17 +42,31 @@ class MeshField:
         trust = np.asarray(confidence, float) + LEAST_CONFIDENCE
         target = np.where(np.asarray(confidence, bool)[:, None], measured, 0.0)
         system = csc_array(diags_array(trust) + stiffness * self._roughness)
-        return splu(system).solve(np.asarray(confidence, float)[:, None] * target)
+        factor = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        return factor.solve(np.asarray(confidence, float)[:, None] * target)
 
     def stray(self, values: Float[np.ndarray, "n k"], known: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Distance of each value from the median of its known neighbours and their neighbours; inf if unknown."""
-        distance = np.full(len(values), np.inf)
-        for k in np.nonzero(known)[0]:
-            around = self._neighbours[k]
-            around = around[known[around]]
-            if len(around):
-                distance[k] = np.linalg.norm(values[k] - np.median(values[around], axis=0))
-        return distance
+        """Distance of each value from the median of its known neighbours; inf where it or all of them are unknown."""
+        return self._from_median(values, values[self._neighbours], known)
+
+    def off_trend(self, values: Float[np.ndarray, "n 2"], known: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """The same, with each neighbour's value continued to the particle by the neighbour's own derivative."""
+        step = self._uv[:, None, :] - self._uv[self._neighbours]
+        continued = values[self._neighbours] + np.einsum("nmij,nmj->nmi", self.jacobian(values)[self._neighbours], step)
+        return self._from_median(values, continued, known)
+
+    def _from_median(
+        self, values: Float[np.ndarray, "n k"], around: Float[np.ndarray, "n m k"], known: Bool[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        usable = (self._neighbours >= 0) & known[self._neighbours]
+        count = usable.sum(axis=1)
+        ordered = np.sort(np.where(usable[..., None], around, np.inf), axis=1)
+        rows = np.arange(len(values))
+        middle = (
+            ordered[rows, np.maximum(count - 1, 0) // 2] + ordered[rows, np.minimum(count // 2, ordered.shape[1] - 1)]
+        ) / 2
+        sure = known & (count > 0)
+        return np.where(sure, np.linalg.norm(values - np.where(sure[:, None], middle, 0), axis=1), np.inf)
 
     def jacobian(self, values: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
         """Derivative of values by first-image pixels, by least squares over each particle's neighbours."""
@@ -65,7 +82,8 @@ def _gradient(uv: Float[np.ndarray, "n 2"], i: np.ndarray, j: np.ndarray) -> tup
     normal = np.zeros((n, 2, 2))
     np.add.at(normal, i, step[:, :, None] * step[:, None, :])
     weight = np.einsum("mij,mj->mi", np.linalg.inv(normal)[i], step)
-    return tuple(
+    along_u, along_v = (
         csr_array((np.concatenate([w, -w]), (np.concatenate([i, i]), np.concatenate([j, i]))), shape=(n, n))
         for w in weight.T
     )
+    return along_u, along_v

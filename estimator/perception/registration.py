@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-
 from jiggle_mj.estimator.perception.lucas_kanade import (
     Match,
     Normalised,
+    Step,
     gradients,
     match,
     normalise,
@@ -26,12 +26,14 @@ FINE = 4.0
 """Standard deviation of the matching window [px]."""
 COARSE = 8.0
 """The same, for the first steps."""
-CONTRAST = 8.0
-"""Standard deviation of the window in which brightness and contrast are evened out [px]."""
+CONTRAST = 27
+"""Width of the square in which brightness and contrast are evened out [px]."""
 LONGEST_STEP = 3.0
 """Steps are cut to this length [px]."""
 STRAY = 1.0
 """A step that differs by more than this from its neighbours' median is replaced by theirs [px]."""
+LEAST_AGREEMENT = 0.2
+"""Steps from windows that look alike over less than this share are not taken."""
 LEAST_CORRELATION = 0.6
 """Below this a particle is not seen."""
 
@@ -44,7 +46,7 @@ class Registered:
     """Current pixel (k = 2) or disparity (k = 1) [px]."""
     match: Match
     spread: Float[np.ndarray, "n k k"]
-    """Covariance that white image noise of the residual's size would give [px^2]."""
+    """Covariance that residuals of this size would give, were they independent from pixel to pixel [px^2]."""
     last_step: Float[np.ndarray, " n"]
     """Length of the last step [px]: not small where the steps did not settle."""
 
@@ -54,11 +56,12 @@ class MaterialRegistration:
 
     def __init__(self, first: Float[np.ndarray, "height width"], material: MaterialMap, field: MeshField):
         self._material, self._field = material, field
-        self._template = normalise(first[material.region], material.support, window=CONTRAST)
+        self._template = normalise(first[material.region], material.support, width=CONTRAST)
 
     def refine(
         self,
         grey: Float[np.ndarray, "height width"],
+        tissue: Bool[np.ndarray, "height width"],
         start: Float[np.ndarray, "n 2"],
         *,
         windows: tuple[float, ...],
@@ -67,33 +70,50 @@ class MaterialRegistration:
 
         Args:
             grey: current left image.
+            tissue: its tissue pixels; nothing else is compared.
             start: guessed current pixel of each particle.
             windows: standard deviations of the matching windows, one a step [px].
         """
         value = start
-        for window in windows:
-            warped = self._warp(grey, value)
-            step = step_in_plane(self._template, warped, self._material, window=window)
-            jacobian = self._field.jacobian(value)
-            shift = np.einsum("nij,nj->ni", jacobian, _shorten(step.shift))
-            seen = match(self._template, warped, self._material, window=window).correlation > 0.3
-            shift = _settle(self._field, shift, seen & step.shift.any(axis=1))
-            value = value + shift
-        warped = self._warp(grey, value)
+        for window in windows[:-1]:
+            value, _ = self._advance(grey, tissue, value, window)
+        jacobian = self._field.jacobian(value)
+        settled, step = self._advance(grey, tissue, value, windows[-1])
+        warped = self._warp(grey, tissue, settled)
         information = np.linalg.pinv(step.information, hermitian=True)
         quality = match(self._template, warped, self._material, window=FINE)
         spread = _white_noise(quality, windows[-1]) * (jacobian @ information @ jacobian.transpose(0, 2, 1))
-        return Registered(value=value, match=quality, spread=spread, last_step=np.linalg.norm(shift, axis=1))
+        return Registered(
+            value=settled, match=quality, spread=spread, last_step=np.linalg.norm(settled - value, axis=1)
+        )
 
-    def _warp(self, grey: Float[np.ndarray, "height width"], value: Float[np.ndarray, "n 2"]) -> Normalised:
+    def _advance(
+        self,
+        grey: Float[np.ndarray, "height width"],
+        tissue: Bool[np.ndarray, "height width"],
+        value: Float[np.ndarray, "n 2"],
+        window: float,
+    ) -> tuple[Float[np.ndarray, "n 2"], Step]:
+        step = step_in_plane(self._template, self._warp(grey, tissue, value), self._material, window=window)
+        shift = np.einsum("nij,nj->ni", self._field.jacobian(value), _shorten(step.shift))
+        return value + _settle(self._field, shift, step), step
+
+    def _warp(
+        self,
+        grey: Float[np.ndarray, "height width"],
+        tissue: Bool[np.ndarray, "height width"],
+        value: Float[np.ndarray, "n 2"],
+    ) -> Normalised:
         where = self._material.spread(value)
-        warped, inside = sample_inside(grey, where[..., 0], where[..., 1])
-        return normalise(warped, self._material.support & inside, window=CONTRAST)
+        warped = resample(grey, where[..., 0], where[..., 1])
+        seen = sample_mask(tissue, where[..., 0], where[..., 1])
+        return normalise(warped, self._material.support & seen, width=CONTRAST)
 
 
 def refine_disparity(
     left: Float[np.ndarray, "height width"],
     right: Float[np.ndarray, "height width"],
+    tissue: tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]],
     pixels: Float[np.ndarray, "n 2"],
     start: Float[np.ndarray, " n"],
     material: MaterialMap,
@@ -106,6 +126,7 @@ def refine_disparity(
     Args:
         left: current left image.
         right: current right image.
+        tissue: tissue pixels of the left and of the right image; nothing else is compared.
         pixels: current left pixel of each particle.
         start: guessed disparity [px].
         material: maps particles to material pixels.
@@ -113,37 +134,45 @@ def refine_disparity(
         windows: standard deviations of the matching windows, one a step [px].
     """
     where = material.spread(pixels)
-    sampled, inside = sample_inside(left, where[..., 0], where[..., 1])
-    first = normalise(sampled, material.support & inside, window=CONTRAST)
-    slope_left, _ = sample_inside(gradients(left)[0], where[..., 0], where[..., 1])
+    sampled = resample(left, where[..., 0], where[..., 1])
+    support = material.support & sample_mask(tissue[0], where[..., 0], where[..., 1])
+    first = normalise(sampled, support, width=CONTRAST)
+    slope_left = resample(gradients(left)[0], where[..., 0], where[..., 1])
     slope = gradients(right)[0]
 
     def warp(value: Float[np.ndarray, "n 1"]) -> tuple[Normalised, Float[np.ndarray, "h w"]]:
         columns = where[..., 0] - material.spread(value)[..., 0]
-        sampled, inside = sample_inside(right, columns, where[..., 1])
-        second = normalise(sampled, material.support & inside, window=CONTRAST)
-        slope_right, _ = sample_inside(slope, columns, where[..., 1])
+        seen = support & sample_mask(tissue[1], columns, where[..., 1])
+        second = normalise(resample(right, columns, where[..., 1]), seen, width=CONTRAST)
+        slope_right = resample(slope, columns, where[..., 1])
         return second, -(slope_left + slope_right) / (2 * second.deviation)
 
-    value = start[:, None]
-    for window in windows:
+    def advance(value: Float[np.ndarray, "n 1"], window: float) -> tuple[Float[np.ndarray, "n 1"], Step]:
         second, gradient = warp(value)
         step = step_along(first, second, gradient, material, window=window)
-        seen = match(first, second, material, window=window).correlation > 0.3
-        shift = _settle(field, _shorten(step.shift), seen & step.shift.any(axis=1))
-        value = value + shift
-    quality = match(first, warp(value)[0], material, window=FINE)
+        return value + _settle(field, _shorten(step.shift), step), step
+
+    value = start[:, None]
+    for window in windows[:-1]:
+        value, _ = advance(value, window)
+    settled, step = advance(value, windows[-1])
+    quality = match(first, warp(settled)[0], material, window=FINE)
     spread = _white_noise(quality, windows[-1]) / np.maximum(step.information, 1e-9)
-    return Registered(value=value, match=quality, spread=spread, last_step=np.abs(shift[:, 0]))
+    return Registered(value=settled, match=quality, spread=spread, last_step=np.abs(settled - value)[:, 0])
 
 
-def sample_inside(
+def resample(
     image: Float[np.ndarray, "height width"], columns: Float[np.ndarray, "h w"], rows: Float[np.ndarray, "h w"]
-) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """An image at given pixels, bicubic, and which of them lie inside it."""
-    height, width = image.shape
-    inside = (columns >= 0) & (columns <= width - 1) & (rows >= 0) & (rows <= height - 1)
-    return cv2.remap(image, columns, rows, cv2.INTER_CUBIC), inside
+) -> Float[np.ndarray, "h w"]:
+    """An image at given pixels, bicubic."""
+    return cv2.remap(image, columns, rows, cv2.INTER_CUBIC)
+
+
+def sample_mask(
+    mask: Bool[np.ndarray, "height width"], columns: Float[np.ndarray, "h w"], rows: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """A mask at given pixels, False outside the image."""
+    return cv2.remap(mask.astype(np.uint8), columns, rows, cv2.INTER_NEAREST, borderValue=0) > 0
 
 
 def _shorten(shift: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
@@ -151,13 +180,11 @@ def _shorten(shift: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     return shift * np.minimum(1, LONGEST_STEP / np.maximum(length, 1e-9))
 
 
-def _settle(
-    field: MeshField, shift: Float[np.ndarray, "n k"], known: Bool[np.ndarray, " n"]
-) -> Float[np.ndarray, "n k"]:
-    """Steps as measured where they agree with their neighbours', filled in smoothly elsewhere."""
-    known = known & (field.stray(shift, known) < STRAY)
-    filled = field.fill(shift, known)
-    return np.where(known[:, None], shift, filled)
+def _settle(field: MeshField, shift: Float[np.ndarray, "n k"], step: Step) -> Float[np.ndarray, "n k"]:
+    """Shifts as measured where windows look alike and neighbours agree, filled in smoothly elsewhere."""
+    known = (step.agreement > LEAST_AGREEMENT) & step.shift.any(axis=1)
+    known &= field.stray(shift, known) < STRAY
+    return np.where(known[:, None], shift, field.fill(shift, known))
 
 
 def _white_noise(quality: Match, window: float) -> Float[np.ndarray, "n 1 1"]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from jiggle_mj.estimator.perception.tissue_mask import SECOND_BLOB
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
@@ -27,6 +28,10 @@ MOST_SAMPLES = 20000
 """Pixels that a surface is fitted to."""
 FINEST_DISPARITY = 0.01
 """No disparity is known better than this [px]."""
+CAUCHY = 2.0
+"""Residual, in standard deviations, at which a sample counts half."""
+REWEIGHTINGS = 10
+"""Rounds of reweighting; the weights are steady to 1 % after about six."""
 HIGHEST_DEGREE = 4
 """Highest degree of the polynomial through the disparity. A plane's disparity is of degree 1."""
 
@@ -87,15 +92,24 @@ def lay_mesh(
 class DisparitySurface:
     """A polynomial d(u, v) through disparities, robust against mismatches.
 
-    Iteratively reweighted least squares with Cauchy weights, their scale from the median absolute residual. The
-    degree is the one with the least Bayesian information criterion, m log(s^2) + k log(m), with s that scale, k
-    coefficients and m samples.
+    Iteratively reweighted least squares with Cauchy weights, their scale s from the median absolute residual. The
+    degree is the one with the least robust Bayesian information criterion,
+
+        sum_i c^2 log(1 + (r_i / c s)^2) + k log(m),   c = 2,
+
+    with k coefficients, m samples and the scale s of the highest degree.
     """
 
     def __init__(self, pixels: Float[np.ndarray, "m 2"], disparity: Float[np.ndarray, " m"]):
         self._middle, self._scale = pixels.mean(axis=0), pixels.std(axis=0).max()
         fits = [self._fit(pixels, disparity, degree) for degree in range(1, HIGHEST_DEGREE + 1)]
-        self.degree, self._coefficients, _ = min(fits, key=lambda fit: fit[2])
+        scale = _scale_of(fits[-1][1])
+        criteria = [
+            np.sum(CAUCHY**2 * np.log1p((residual / (CAUCHY * scale)) ** 2)) + len(coefficients) * np.log(len(residual))
+            for coefficients, residual in fits
+        ]
+        self.degree = int(np.argmin(criteria)) + 1
+        self._coefficients = fits[self.degree - 1][0]
 
     def __call__(self, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
         """Pixel and fitted disparity [px]."""
@@ -108,17 +122,21 @@ class DisparitySurface:
 
     def _fit(
         self, pixels: Float[np.ndarray, "m 2"], disparity: Float[np.ndarray, " m"], degree: int
-    ) -> tuple[int, Float[np.ndarray, " k"], float]:
-        """Degree, coefficients and information criterion."""
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " m"]]:
+        """Coefficients and residuals."""
         basis, weight = self._basis(pixels, degree), np.ones(len(disparity))
-        for _ in range(10):
+        coefficients, residual = np.zeros(basis.shape[1]), disparity
+        for _ in range(REWEIGHTINGS):
             root = np.sqrt(weight)
             coefficients = np.linalg.lstsq(basis * root[:, None], disparity * root, rcond=None)[0]
             residual = disparity - basis @ coefficients
-            scale = max(1.4826 * float(np.median(np.abs(residual))), FINEST_DISPARITY)
-            weight = 1 / (1 + (residual / (2 * scale)) ** 2)
-        criterion = 2 * len(disparity) * np.log(scale) + basis.shape[1] * np.log(len(disparity))
-        return degree, coefficients, float(criterion)
+            weight = 1 / (1 + (residual / (CAUCHY * _scale_of(residual))) ** 2)
+        return coefficients, residual
+
+
+def _scale_of(residual: Float[np.ndarray, " m"]) -> float:
+    """Robust standard deviation: 1.4826 times the median absolute residual."""
+    return max(1.4826 * float(np.median(np.abs(residual))), FINEST_DISPARITY)
 
 
 def surface_through(
@@ -183,7 +201,13 @@ def _outline(mask: Bool[np.ndarray, "height width"], inset: float, frame: _Plane
     contours, _ = cv2.findContours((depth > inset).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
         raise PerceptionError("the tissue is thinner than the mesh's inset from its rim; lower the spacing.")
-    contour = max(contours, key=cv2.contourArea)[:, 0, :].astype(float) - 1
+    largest, *others = sorted(contours, key=cv2.contourArea, reverse=True)
+    if others and cv2.contourArea(others[0]) > SECOND_BLOB * cv2.contourArea(largest):
+        raise PerceptionError(
+            "two disconnected sheets in view: the tissue's parts hang together by less than the mesh's spacing; one "
+            "sheet is tracked: cover the other, or pass a mask that leaves it out."
+        )
+    contour = largest[:, 0, :].astype(float) - 1
     return frame.from_image(contour)
 
 

@@ -10,10 +10,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-
-from jiggle_mj.camera import StereoCamera
-from jiggle_mj.errors import PerceptionError
-from jiggle_mj.estimate import Sheet
 from jiggle_mj.estimator.perception.disparity import Disparity, SemiGlobalMatching
 from jiggle_mj.estimator.perception.flow import dense_flow, flow_at
 from jiggle_mj.estimator.perception.material_map import MaterialMap
@@ -26,17 +22,44 @@ from jiggle_mj.estimator.perception.registration import (
     MaterialRegistration,
     Registered,
     refine_disparity,
+    sample_mask,
 )
 from jiggle_mj.estimator.perception.sheet_mesh import LEAST_MATCHED, DisparitySurface, lay_mesh
 from jiggle_mj.estimator.perception.tissue_mask import TissueMask, WarmTissue, largest_blob
+
+from jiggle_mj.camera import StereoCamera
+from jiggle_mj.errors import PerceptionError
+from jiggle_mj.estimate import Sheet
 from jiggle_mj.observation import StereoPair, ToolState
 
+FAR = 2.0
+"""A tool that moved further than this between two frames may have taken the tissue further than flow follows
+[spacings]."""
+MOSTLY_FOUND = 0.8
+"""Share of the particles that must match for a guess to need no rival."""
+STRAY_FLOW = 4.0
+"""Flow that differs by more than this from its neighbours' median is not used [px]."""
+STRAY_DISPARITY = 2.0
+"""The same for dense disparity [px]."""
+DISAGREEMENT = 1.5
+"""Refined disparities further than this from the dense one are not believed [px]."""
+SETTLED = 0.3
+"""The last step of a registration that has settled is shorter than this [px]."""
 UNSEEN_VARIANCE = 1.0
 """Variance of a coordinate of a particle that was not seen: as good as unknown [m^2]."""
-LATERAL_SD = 0.35
-"""Error of a good match that its residual does not show [px]."""
-DISPARITY_SD = 0.08
-"""The same in disparity [px]."""
+LATERAL_SD = 0.08
+"""Error of a perfect match: where a particle lies in the first image's tissue, and resampling [px]."""
+DISPARITY_SD = 0.035
+"""As `LATERAL_SD`, in disparity [px]."""
+NOISE_FACTOR = 3.2
+"""Errors are this many times those of residuals independent from pixel to pixel. White noise smoothed by 0.8 px is
+alike over 4 pi 0.8^2 = 8 px, which makes 2.8; the rest is measured, with image noise of 0 to 6 grey levels."""
+TREND_FACTOR = 0.6
+"""Lateral error of a particle for each pixel that it is off its neighbours' trend, measured."""
+LEAST_SHARE = 0.7
+"""A particle is hidden when less than this share of its window, of what was seen of it at rest, is tissue now."""
+OFF_TREND = 3.0
+"""A particle this far from where its neighbours' motion and stretch put it was mistaken for another [px]."""
 SMALLEST_SHEET = 2000
 """Fewest tissue pixels that can be a sheet."""
 
@@ -106,7 +129,13 @@ class StereoTracker:
         self._material = MaterialMap(uv, mesh.faces, tissue)
         self._field = MeshField(uv, mesh.faces)
         refined = refine_disparity(
-            pair.left_grey, pair.right_grey, uv, mesh.uvd[:, 2], self._material, self._field
+            pair.left_grey,
+            pair.right_grey,
+            (tissue, self._mask(pair.right)),
+            uv,
+            mesh.uvd[:, 2],
+            self._material,
+            self._field,
         )
         good = refined.match.correlation > LEAST_CORRELATION
         if good.mean() < LEAST_MATCHED:
@@ -118,6 +147,7 @@ class StereoTracker:
         self._first, self._first_uvd = pair.left_grey, uvd
         self._registration = MaterialRegistration(pair.left_grey, self._material, self._field)
         everywhere = np.ones(len(uv), bool)
+        self._whole = self._registration.refine(pair.left_grey, tissue, uv, windows=(FINE,)).match.share
         self._last = _Last(grey=pair.left_grey, uvd=uvd, visible=everywhere, tool=tool)
         return Sheet(rest=self._camera.back_project(uvd), faces=mesh.faces)
 
@@ -132,81 +162,109 @@ class StereoTracker:
         Raises:
             ValueError: called before `start`.
         """
-        if self._last is None:
+        last = self._last
+        if last is None:
             raise ValueError("StereoTracker.track needs a sheet; call start with the first pair.")
         pair = self._rectify(images)
         if pair.black_side is not None:
-            return self._measurement(self._last.uvd, np.zeros(len(predicted), bool), np.zeros((len(predicted), 3, 3)))
-        start = self._guess(pair, tool, predicted)
-        plane = self._registration.refine(pair.left_grey, start[:, :2], windows=(COARSE, COARSE, FINE, FINE, FINE))
+            return self._measurement(last.uvd, np.zeros(len(last.uvd), bool), np.zeros((len(last.uvd), 3, 3)))
+        tissue, tissue_right = self._mask(pair.left), self._mask(pair.right)
+        start = self._guess(pair, tissue, last, tool, self._camera.project(predicted))
+        plane = self._registration.refine(
+            pair.left_grey, tissue, start[:, :2], windows=(COARSE, COARSE, FINE, FINE, FINE)
+        )
         dense = self._disparity(pair.left, pair.right)
         coarse, sure = self._coarse_disparity(dense, plane.value, start[:, 2])
         depth = refine_disparity(
-            pair.left_grey, pair.right_grey, plane.value, coarse, self._material, self._field
+            pair.left_grey, pair.right_grey, (tissue, tissue_right), plane.value, coarse, self._material, self._field
         )
         uvd = np.concatenate([plane.value, depth.value], axis=1)
-        visible = self._accept(pair, plane, depth, coarse, sure)
+        visible = self._accept(tissue, plane, depth, coarse, sure)
+        off_trend = self._field.off_trend(plane.value, visible)
+        visible &= off_trend < OFF_TREND
         self._last = _Last(grey=pair.left_grey, uvd=uvd, visible=visible, tool=tool)
         noise = np.zeros((len(uvd), 3, 3))
-        noise[:, :2, :2] = LATERAL_SD**2 * np.eye(2) + plane.spread
-        noise[:, 2, 2] = DISPARITY_SD**2 + depth.spread[:, 0, 0]
+        lateral = LATERAL_SD**2 + (TREND_FACTOR * np.where(visible, off_trend, 0)) ** 2
+        noise[:, :2, :2] = lateral[:, None, None] * np.eye(2) + NOISE_FACTOR**2 * plane.spread
+        noise[:, 2, 2] = DISPARITY_SD**2 + NOISE_FACTOR**2 * depth.spread[:, 0, 0]
         return self._measurement(uvd, visible, noise)
 
     def _guess(
-        self, pair: RectifiedPair, tool: ToolState, predicted: Float[np.ndarray, "n 3"]
+        self,
+        pair: RectifiedPair,
+        tissue: Bool[np.ndarray, "height width"],
+        last: _Last,
+        tool: ToolState,
+        believed: Float[np.ndarray, "n 3"],
     ) -> Float[np.ndarray, "n 3"]:
-        """Pixel and disparity to start from: continued from the last frame, or from rest, whichever matches better."""
-        last = self._last
-        known = last.visible
-        before = np.where(known[:, None], last.uvd, self._camera.project(predicted))
-        guesses = [self._moved(last.grey, before, pair.left_grey)]
-        if tool.grasp != last.tool.grasp or tool.closed != last.tool.closed or self._far(tool):
-            guesses.append(self._moved(self._first, self._first_uvd, pair.left_grey))
-        if len(guesses) == 1:
-            return guesses[0]
-        share = [
-            np.mean(
-                self._registration.refine(pair.left_grey, guess[:, :2], windows=(COARSE,)).match.correlation
-                > LEAST_CORRELATION
-            )
-            for guess in guesses
-        ]
-        return guesses[int(np.argmax(share))]
+        """Pixel and disparity to start from: carried on from the last frame, from rest or from the belief.
 
-    def _far(self, tool: ToolState) -> bool:
-        """Whether the tool moved further than flow follows: two spacings."""
-        return bool(np.linalg.norm(tool.position - self._last.tool.position) > 2 * self._spacing)
+        The last two are tried where the sheet may have jumped (the jaws opened or closed, the tool went far) or where
+        carrying on lost much of it; what then matches best is taken.
+        """
+        before = np.where(last.visible[:, None], last.uvd, believed)
+        best = self._moved(last.grey, before, pair.left_grey)
+        share = self._found(pair, tissue, best)
+        jaws = (tool.grasp, tool.closed) != (last.tool.grasp, last.tool.closed)
+        far = np.linalg.norm(tool.position - last.tool.position) > FAR * self._spacing
+        if jaws or far or share < MOSTLY_FOUND:
+            for guess in (self._moved(self._first, self._first_uvd, pair.left_grey), believed):
+                found = self._found(pair, tissue, guess)
+                if found > share:
+                    best, share = guess, found
+        return best
+
+    def _found(
+        self, pair: RectifiedPair, tissue: Bool[np.ndarray, "height width"], guess: Float[np.ndarray, "n 3"]
+    ) -> float:
+        """Share of the particles that match after one coarse step from a guess."""
+        tried = self._registration.refine(pair.left_grey, tissue, guess[:, :2], windows=(COARSE,))
+        return float(np.mean(tried.match.correlation > LEAST_CORRELATION))
 
     def _moved(
         self, grey: Float[np.ndarray, "height width"], uvd: Float[np.ndarray, "n 3"], now: Float[np.ndarray, "h w"]
     ) -> Float[np.ndarray, "n 3"]:
         """Particles carried along by the flow between two images, smooth where the flow cannot be used."""
         moved, usable = flow_at(uvd[:, :2], *dense_flow(grey, now))
-        usable &= self._field.stray(moved, usable) < 4.0
+        usable &= self._field.stray(moved, usable) < STRAY_FLOW
         filled = self._field.fill(moved, usable)
         return uvd + np.pad(np.where(usable[:, None], moved, filled), ((0, 0), (0, 1)))
 
-    def _coarse_disparity(self, dense, pixels, before):
+    def _coarse_disparity(
+        self,
+        dense: Float[np.ndarray, "height width"],
+        pixels: Float[np.ndarray, "n 2"],
+        before: Float[np.ndarray, " n"],
+    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         """Dense disparity at the particles, without strays; carried on from `before` where there is none."""
         x, y = pixels.astype(np.float32).T
         value = cv2.remap(dense, x[None], y[None], cv2.INTER_NEAREST, borderValue=np.nan)[0].astype(float)
         change = np.where(np.isfinite(value), value - before, 0)[:, None]
         sure = np.isfinite(value)
-        sure &= self._field.stray(change, sure) < 2.0
+        sure &= self._field.stray(change, sure) < STRAY_DISPARITY
         filled = self._field.fill(change, sure)
         return before + np.where(sure, change[:, 0], filled[:, 0]), sure
 
-    def _accept(self, pair, plane: Registered, depth: Registered, coarse, sure) -> Bool[np.ndarray, " n"]:
-        """In frame, tissue-coloured, alike in all images, and settled."""
+    def _accept(
+        self,
+        tissue: Bool[np.ndarray, "height width"],
+        plane: Registered,
+        depth: Registered,
+        coarse: Float[np.ndarray, " n"],
+        sure: Bool[np.ndarray, " n"],
+    ) -> Bool[np.ndarray, " n"]:
+        """In frame, tissue-coloured, not half hidden, alike in all images, and settled."""
         x, y = plane.value.astype(np.float32).T
-        tissue = cv2.GaussianBlur(self._mask(pair.left).astype(np.float32), (0, 0), 2.0)
-        coloured = cv2.remap(tissue, x[None], y[None], cv2.INTER_LINEAR, borderValue=0)[0] > 0.5
-        alike = (plane.match.correlation > LEAST_CORRELATION) & (depth.match.correlation > LEAST_CORRELATION)
-        settled = (plane.last_step < 0.5) & (depth.last_step < 0.2)
-        consistent = ~sure | (np.abs(depth.value[:, 0] - coarse) < 1.5)
-        return coloured & alike & settled & consistent & (depth.value[:, 0] > 0)
+        coloured = sample_mask(tissue, x[None], y[None])[0]
+        whole = np.minimum(plane.match.share, depth.match.share) > LEAST_SHARE * self._whole
+        alike = np.minimum(plane.match.correlation, depth.match.correlation) > LEAST_CORRELATION
+        settled = (plane.last_step < SETTLED) & (depth.last_step < SETTLED)
+        consistent = ~sure | (np.abs(depth.value[:, 0] - coarse) < DISAGREEMENT)
+        return coloured & whole & alike & settled & consistent & (depth.value[:, 0] > 0)
 
-    def _measurement(self, uvd, visible, noise) -> Track:
+    def _measurement(
+        self, uvd: Float[np.ndarray, "n 3"], visible: Bool[np.ndarray, " n"], noise: Float[np.ndarray, "n 3 3"]
+    ) -> Track:
         """Carry pixels and their covariance into the world."""
         uvd = np.where(uvd[:, 2:] > 0.1, uvd, self._first_uvd)
         jacobian = self._camera.back_projection_jacobian(uvd)

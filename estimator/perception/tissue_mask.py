@@ -7,7 +7,7 @@ Does not decide what the sheet is: `largest_blob` does, and refuses two sheets.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ SECOND_BLOB = 0.25
 """A second blob above this fraction of the largest one's area is a second sheet, not a fleck."""
 
 
+@runtime_checkable
 class TissueMask(Protocol):
     """Anything that says which pixels are tissue."""
 

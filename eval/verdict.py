@@ -1,0 +1,51 @@
+"""What was found, in one or two sentences for people."""
+
+import numpy as np
+from jiggle_mj.eval.carrying import CarriedTruth
+from jiggle_mj.eval.flat_map import Plane
+from jiggle_mj.eval.metrics import dilate, patches
+
+from jiggle_mj.estimate import Detection, Estimate, Sheet
+
+NAMED_PATCHES = 3
+"""Patches whose place is spelled out; the others are counted."""
+
+
+def found(sheet: Sheet, detection: Detection, last: Estimate, plane: Plane) -> str:
+    """How many particles are reported attached, in which patches, where, and how stiff."""
+    groups = patches(detection.attached, sheet.faces)
+    total = int(detection.attached.sum())
+    if not groups:
+        return "No particle is reported attached."
+    flat, (first, second) = plane.flatten(sheet.rest) * 1e3, plane.names
+    places = []
+    for group in groups[:NAMED_PATCHES]:
+        x, y = flat[group].mean(axis=0)
+        places.append(f"{len(group)} around {first} = {_integer(x)} mm, {second} = {_integer(y)} mm")
+    rest = len(groups) - len(places)
+    listed = "; ".join(places) + (f"; and {rest} smaller {'one' if rest == 1 else 'ones'}" if rest > 0 else "")
+    verb = "particle is" if total == 1 else "particles are"
+    counted = "in one patch" if len(groups) == 1 else f"in {len(groups)} patches"
+    stiffness = float(np.mean(last.mean[detection.attached]))
+    return f"{total} {verb} reported attached, {counted} ({listed}), at {stiffness:.2g} N/m each on average."
+
+
+def against_truth(sheet: Sheet, detection: Detection, carried: CarriedTruth) -> str:
+    """How many of the reported are right, and how many of the attached were found, exactly and within one ring."""
+    detected, attached = detection.attached, carried.attached
+    n_detected, n_attached = int(detected.sum()), int(attached.sum())
+    if not n_attached:
+        return "In truth nothing is attached." + (f" All {n_detected} reports are false." if n_detected else "")
+    wide, grown = dilate(attached, sheet.faces, 1), dilate(detected, sheet.faces, 1)
+    exact, near = int((attached & detected).sum()), int((attached & grown).sum())
+    text = f"In truth {n_attached} {'is' if n_attached == 1 else 'are'} attached: "
+    text += f"{exact} of them reported exactly, {near} within one mesh ring"
+    if n_detected:
+        false = int((detected & ~wide).sum())
+        verb = "lie" if false > 1 else "lies"
+        text += f"; {false or 'none'} of the {n_detected} reports {verb} more than one ring off"
+    return text + "."
+
+
+def _integer(value: float) -> str:
+    return f"{value:+.0f}".replace("-", "\N{MINUS SIGN}").replace("+0", "0").lstrip("+")

@@ -1,0 +1,135 @@
+"""Tables of a TOML file read strictly: every key has a kind, and a key that nobody asked for is an error.
+
+A kind is a function that returns the value, or raises `TypeError` with the words for what it must be.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jiggle_mj.errors import RecordingError
+
+REQUIRED = object()
+
+
+class StrictTable:
+    """A table of the TOML file that knows which of its keys were asked for."""
+
+    def __init__(self, values: dict[str, Any], where: str, *, given: bool = True) -> None:
+        self.values, self.where, self.given, self.known = values, where, given, set[str]()
+
+    def take(self, key: str, kind: Callable[[Any], Any], default: Any = REQUIRED) -> Any:
+        """The value of a key, or the default where it is not there.
+
+        Raises:
+            RecordingError: missing without a default, or not of that kind.
+        """
+        self.known.add(key)
+        if key not in self.values:
+            if default is REQUIRED:
+                raise RecordingError(f"{self.where} lacks the key '{key}'.")
+            return default
+        try:
+            return kind(self.values[key])
+        except TypeError as failure:
+            raise RecordingError(f"{self.where} {key} must be {failure}; got {self.values[key]!r}.") from failure
+
+    def table(self, key: str, *, optional: bool = False) -> "StrictTable":
+        """The table under a key; an optional one that is missing is empty."""
+        values = self.take(key, table, {} if optional else REQUIRED)
+        path = self.where.partition(" [")[2].rstrip("]")
+        inner = f"{path}.{key}" if path else key
+        return StrictTable(values, f"{self.where.partition(' [')[0]} [{inner}]", given=key in self.values)
+
+    def direction(self, key: str) -> Float[np.ndarray, " 3"]:
+        """The unit vector along a key's three numbers."""
+        given = np.array(self.take(key, vector))
+        length = np.linalg.norm(given)
+        if not length > 0:
+            raise RecordingError(f"{self.where} {key} must have a direction; got {given.tolist()}.")
+        return given / length
+
+    def refuse_unknown(self) -> None:
+        """Refuse the keys that nobody has taken.
+
+        Raises:
+            RecordingError: naming the first, and all that are known.
+        """
+        unknown = sorted(set(self.values) - self.known)
+        if unknown:
+            raise RecordingError(
+                f"{self.where} has the unknown key '{unknown[0]}'; known: {', '.join(sorted(self.known))}."
+            )
+
+
+def text(value: Any) -> str:
+    """A string."""
+    if not isinstance(value, str):
+        raise TypeError("a text")
+    return value
+
+
+def texts(value: Any) -> tuple[str, ...]:
+    """A list of strings."""
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise TypeError("a list of texts")
+    return tuple(value)
+
+
+def flag(value: Any) -> bool:
+    """True or false."""
+    if not isinstance(value, bool):
+        raise TypeError("true or false")
+    return value
+
+
+def number(value: Any) -> float:
+    """A finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise TypeError("a number")
+    return float(value)
+
+
+def positive(value: Any) -> float:
+    """A finite number above 0."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+        raise TypeError("a number above 0")
+    return float(value)
+
+
+def count(value: Any) -> int:
+    """A whole number from 0."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise TypeError("a whole number from 0")
+    return value
+
+
+def counts(value: Any) -> list[int]:
+    """A list of whole numbers from 0."""
+    if not isinstance(value, list):
+        raise TypeError("a list of whole numbers")
+    return [count(item) for item in value]
+
+
+def vector(value: Any) -> list[float]:
+    """Three numbers."""
+    if not isinstance(value, list) or len(value) != 3:
+        raise TypeError("three numbers")
+    return [number(item) for item in value]
+
+
+def matrix(value: Any) -> list[list[float]]:
+    """Three rows of three numbers."""
+    if not isinstance(value, list) or len(value) != 3:
+        raise TypeError("three rows of three numbers")
+    return [vector(row) for row in value]
+
+
+def table(value: Any) -> dict[str, Any]:
+    """A table, as it is."""
+    if not isinstance(value, dict):
+        raise TypeError("a table")
+    return value

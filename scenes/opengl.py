@@ -1,0 +1,32 @@
+"""Imports MuJoCo with offscreen OpenGL, or without any where the machine has none: physics needs no picture.
+
+MuJoCo reads MUJOCO_GL and loads the driver's libraries while it is imported, so this runs before any other import of
+it. Whether a context can be made is known only when a renderer is built: see `stereo`.
+"""
+
+import os
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+BACKEND = os.environ["MUJOCO_GL"]
+"""The OpenGL backend that was asked for."""
+
+IMPORT_ERROR: Exception | None = None
+"""Why the backend's libraries could not be loaded; None if they were."""
+
+try:
+    import mujoco  # noqa: F401
+except (AttributeError, ImportError, OSError) as error:
+    IMPORT_ERROR = error
+    os.environ["MUJOCO_GL"] = "disabled"
+    import mujoco  # noqa: F401
+
+    os.environ["MUJOCO_GL"] = BACKEND
+
+
+def no_opengl(reason: BaseException | str) -> str:
+    """What to tell someone whose machine has no offscreen OpenGL."""
+    return (
+        f"No offscreen OpenGL: MUJOCO_GL={BACKEND} failed ({IMPORT_ERROR or reason}). Install libegl1 libgl1 "
+        "libgl1-mesa-dri, or set MUJOCO_GL=osmesa with libosmesa6; see 'jiggle-mj doctor'."
+    )

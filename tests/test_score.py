@@ -1,0 +1,183 @@
+"""`result.json`: its exact keys, what the truth fills in and what it leaves alone, on disk and off."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jiggle_mj.eval.score import read_result, result, score, with_truth, write_result
+
+from jiggle_mj.errors import OutputError, RecordingError
+from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.estimate_recording import EstimateWriter
+from jiggle_mj.truth import Truth, TruthFrame
+from jiggle_mj.truth_recording import write_truth
+
+REST = np.column_stack([np.arange(6) * 0.01, np.arange(6) % 2 * 0.01, np.zeros(6)])
+FACES = np.array([[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]])
+STIFFNESS = np.array([0.8, 0.8, 0, 0, 0, 0])
+SHEET = Sheet(rest=REST, faces=FACES)
+DETECTION = Detection(
+    attached=np.array([True, False, False, False, False, True]), score=np.array([3.0, 2, 0, 0, 0, 1]), rule="b > 0.5"
+)
+BELIEF = Belief(mean=np.array([0.9, 0.6, 0, 0, 0, 0.2]), covariance=np.eye(6) * 0.01)
+
+
+def estimate(index: int) -> Estimate:
+    return Estimate(
+        index=index,
+        time=index * 1000,
+        positions=REST,
+        observed=REST + np.array([0, 0, 0.0003]),
+        mean=np.maximum(0, BELIEF.mean),
+        sd=np.full(6, 0.1),
+        held=np.zeros(6, bool),
+        entropy=5.0 - index,
+        nis=1.0,
+        boundary_energy=0.0,
+        update_s=0.1 * (index + 1),
+        perception_s=0.2,
+    )
+
+
+ESTIMATES = [estimate(0), estimate(2)]
+TRUTH = Truth(
+    rest=REST,
+    faces=FACES,
+    attached=STIFFNESS > 0,
+    frames=tuple(
+        TruthFrame(index=k, time=k * 1000, positions=REST, stiffness=STIFFNESS, tip=np.zeros(3)) for k in range(3)
+    ),
+    scene="by hand",
+    details={},
+)
+
+
+def unscored() -> dict:
+    return result(
+        scene="by hand",
+        seed=3,
+        sensing="points",
+        estimator="implicit",
+        policy="corners",
+        sheet=SHEET,
+        estimates=ESTIMATES,
+        detection=DETECTION,
+        prior_entropy=9.0,
+        skipped=[(1, "NaN in the pose")],
+    )
+
+
+def scored(**changes) -> dict:
+    parts = {"sheet": SHEET, "estimates": ESTIMATES, "belief": BELIEF, "detection": DETECTION, "truth": TRUTH}
+    return with_truth(unscored(), **(parts | changes))
+
+
+def keys(value: object) -> object:
+    """The tree of keys of nested dictionaries."""
+    return {name: keys(inner) for name, inner in value.items()} if isinstance(value, dict) else None
+
+
+def test_the_keys_are_those_of_the_contract_scored_or_not():
+    """As the result file is documented, with `procedure` only where there is one; scoring adds and drops none."""
+    rings = {ring: dict.fromkeys(("pcd", "pug", "f1")) for ring in ("0", "1", "2")}
+    contract = {
+        **dict.fromkeys(("scene", "seed", "sensing", "estimator", "policy", "n_particles", "n_frames")),
+        "detection": {
+            **dict.fromkeys(("rule", "n_detected", "n_attached", "n_observable", "average_precision")),
+            "by_dilation": rings,
+            "observable": {"by_dilation": rings},
+        },
+        "calibration": dict.fromkeys(("nees_per_dof", "coverage_90", "ece")),
+        "tracking": {"rms_m": None},
+        "safety": dict.fromkeys(("limit_j", "max_mean_boundary_energy_j", "violations")),
+        "entropy": dict.fromkeys(("prior", "final")),
+        "frames": dict.fromkeys(("used", "skipped")),
+        "timing": {
+            "update_s": dict.fromkeys(("median", "p95")),
+            **dict.fromkeys(("perception_s", "plan_s", "simulation_s")),
+        },
+    }
+    assert keys(unscored()) == contract
+    assert keys(scored()) == contract
+
+
+def test_the_estimators_own_figures_by_hand():
+    """Two used frames of 0.1 and 0.3 s and one skipped: median 0.2 s, 95th percentile 0.1 + 0.95 * 0.2 s."""
+    figures = unscored()
+    assert (figures["n_particles"], figures["n_frames"], figures["frames"]["used"]) == (6, 3, 2)
+    assert figures["frames"]["skipped"] == [{"index": 1, "why": "NaN in the pose"}]
+    assert figures["timing"]["update_s"] == pytest.approx({"median": 0.2, "p95": 0.29})
+    assert figures["entropy"] == {"prior": 9.0, "final": 3.0}
+    assert figures["detection"]["n_detected"] == 2 and figures["detection"]["n_attached"] is None
+
+
+def test_the_truths_figures_by_hand():
+    """Reported {0, 5}, attached {0, 1}: PCD = PUG = 1/2; scores rank 0, 1 first, so AP = 1; RMS 0.3 mm.
+
+    Same mesh, so b* is unscaled: errors 0.1, -0.2, 0, 0, 0, 0.2 with variance 0.01, NEES/dof = 0.09/0.01/6 = 1.5, and
+    four of six lie within 1.645 sd = 0.164. At one ring 5 is still no neighbour of 0 or 1 and 0 reaches 1.
+    """
+    figures = scored()
+    assert figures["detection"]["by_dilation"]["0"] == {"pcd": 0.5, "pug": 0.5, "f1": 0.5}
+    assert figures["detection"]["by_dilation"]["1"] == pytest.approx({"pcd": 0.5, "pug": 1.0, "f1": 2 / 3})
+    assert (figures["detection"]["n_attached"], figures["detection"]["average_precision"]) == (2, 1.0)
+    assert figures["calibration"] == {
+        "nees_per_dof": pytest.approx(1.5),
+        "coverage_90": pytest.approx(4 / 6),
+        "ece": None,
+    }
+    assert figures["tracking"]["rms_m"] == pytest.approx(3e-4)
+    assert figures["safety"] == {"limit_j": None, "max_mean_boundary_energy_j": 0.0, "violations": None}
+
+
+def test_a_tissue_without_attachments_has_no_recall_but_counts_reports():
+    free = replace(
+        TRUTH, attached=np.zeros(6, bool), frames=tuple(replace(f, stiffness=np.zeros(6)) for f in TRUTH.frames)
+    )
+    figures = scored(truth=free)["detection"]
+    assert (figures["n_detected"], figures["n_attached"], figures["average_precision"]) == (2, 0, None)
+    assert figures["by_dilation"]["1"] == {"pcd": 0.0, "pug": None, "f1": 0.0}
+    silent = replace(DETECTION, attached=np.zeros(6, bool))
+    figures = scored(truth=free, detection=silent)["detection"]
+    assert (figures["n_detected"], figures["by_dilation"]["0"]) == (0, {"pcd": None, "pug": None, "f1": None})
+
+
+def written(folder):
+    """A folder as `estimate` leaves it, and the truth beside it."""
+    write_result(folder / "result.json", unscored())
+    with EstimateWriter(folder / "estimate.mcap", SHEET, {}) as writer:
+        for one in ESTIMATES:
+            writer.write(one)
+        writer.finish(BELIEF, DETECTION, skipped=[(1, "NaN in the pose")])
+    write_truth(folder / "run.truth.mcap", TRUTH)
+    return folder
+
+
+def test_scoring_a_folder_gives_the_figures_of_memory_and_keeps_the_timing(tmp_path):
+    """The files carry float64, so the figures are equal, and the wall times are those of the first run."""
+    folder = written(tmp_path)
+    figures = score(folder, folder / "run.truth.mcap")
+    assert figures == json.loads((folder / "result.json").read_text()) == json.loads(json.dumps(scored()))
+    assert figures["timing"] == unscored()["timing"]
+
+
+def test_a_folder_that_cannot_be_scored_is_refused_with_what_to_do(tmp_path):
+    folder = written(tmp_path)
+    with pytest.raises(RecordingError):
+        score(folder, folder / "estimate.mcap")
+    other = replace(TRUTH, frames=tuple(replace(f, index=f.index + 50) for f in TRUTH.frames))
+    write_truth(folder / "other.truth.mcap", other)
+    with pytest.raises(RecordingError, match="truth of the same recording"):
+        score(folder, folder / "other.truth.mcap")
+    (folder / "estimate.mcap").unlink()
+    with EstimateWriter(folder / "estimate.mcap", SHEET, {}) as writer:
+        writer.write(ESTIMATES[0])
+    with pytest.raises(OutputError, match="ends before its belief"):
+        score(folder, folder / "run.truth.mcap")
+    for content, complaint in (("{", "is not JSON"), ("{}", "not a result of this program")):
+        (folder / "result.json").write_text(content)
+        with pytest.raises(OutputError, match=complaint):
+            read_result(folder / "result.json")
+    with pytest.raises(OutputError, match="cannot be read"):
+        read_result(folder / "absent.json")
