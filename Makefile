@@ -41,8 +41,8 @@ lint: $(SET_UP)
 types: $(SET_UP)
 	rm -rf $(TYPES)
 	$(BIN)/python -c "import setuptools; setuptools.setup()" --quiet build_py --build-lib $(TYPES)
-	cp -r tests tools $(TYPES)
-	cd $(TYPES) && $(BIN)/pyright --pythonpath $(BIN)/python --pythonversion 3.11 .
+	cp -r tests tools typings tools/pyrightconfig.json $(TYPES)
+	$(BIN)/pyright --pythonpath $(BIN)/python --project $(TYPES)
 
 format: $(SET_UP)
 	$(BIN)/ruff check --fix .

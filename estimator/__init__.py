@@ -1,1 +1,5 @@
-"""Placeholder."""
+"""The estimator: perception, the surrogate's physics, and the belief over attachment stiffnesses. Never imports MuJoCo."""
+
+from jiggle_mj.estimator.estimator import Estimator, EstimatorConfig
+
+__all__ = ["Estimator", "EstimatorConfig"]

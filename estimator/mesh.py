@@ -9,9 +9,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
-from scipy.spatial import Delaunay
 
-from jiggle_mj.errors import MeshError
 from jiggle_mj.mesh_checks import check_mesh
 
 
@@ -84,38 +82,3 @@ def pattern(n: int, pairs: Int[np.ndarray, "m 2"]) -> sp.csr_matrix:
     i, j = np.concatenate([pairs, pairs[:, ::-1], np.repeat(np.arange(n)[:, None], 2, axis=1)]).T
     return sp.csr_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(n, n))
 
-
-def triangulate(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "f 3"]:
-    """Delaunay triangles of a nearly flat cloud, seen along its thinnest direction and facing up.
-
-    Long slivers along the outline are peeled off: a face is dropped while it is on the outline and its longest edge
-    exceeds 1.8 times the median.
-
-    Raises:
-        MeshError: fewer than three points, or points on a line.
-    """
-    if len(points) < 3:
-        raise MeshError(f"a sheet needs at least 3 points; got {len(points)}.")
-    centred = points - points.mean(axis=0)
-    _, stretch, axes = np.linalg.svd(centred, full_matrices=False)
-    if stretch[1] < 1e-6 * stretch[0]:
-        raise MeshError("the points lie on a line; a sheet needs two directions.")
-    if np.linalg.det(axes) < 0:
-        axes[1] *= -1
-    if axes[2, 2] < 0:
-        axes[1:] *= -1
-    flat = centred @ axes[:2].T
-    faces = Delaunay(flat).simplices
-    corners = flat[faces]
-    (a, b), (c, d) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
-    faces = np.where((a * d < b * c)[:, None], faces[:, [0, 2, 1]], faces)
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    limit, keep = 1.8 * np.median(longest), np.ones(len(faces), dtype=bool)
-    while True:
-        edges = np.sort(np.concatenate([faces[keep][:, [0, 1]], faces[keep][:, [1, 2]], faces[keep][:, [2, 0]]]), axis=1)
-        _, inverse, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
-        outer = (count[inverse.ravel()] == 1).reshape(3, -1).any(axis=0)
-        drop = np.flatnonzero(keep)[outer & (longest[keep] > limit)]
-        if not len(drop):
-            return faces[keep].astype(np.int64)
-        keep[drop] = False

@@ -25,7 +25,7 @@ from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.mcap_files import McapOutput, iterate_records, read_arrays
 from jiggle_mj.recording_declaration import METADATA, file_metadata
-from jiggle_mj.recording_schemas import WORLD, parse_points, point_cloud, timestamp
+from jiggle_mj.recording_schemas import WORLD, fill_pose, parse_points, point_cloud, timestamp
 
 POINTS, MESH, DIAGNOSTICS = "/estimate/points", "/estimate/mesh", "/diagnostics/filter"
 SHEET, BELIEF, DETECTION = "sheet.npz", "belief.npz", "detection.npz"
@@ -199,7 +199,7 @@ def _mesh_message(estimate: Estimate, sheet: Sheet) -> SceneUpdate:
     message = SceneUpdate()
     entity = message.entities.add(timestamp=timestamp(estimate.time), frame_id=WORLD, id="sheet")
     triangles = entity.triangles.add()
-    triangles.pose.orientation.w = 1.0
+    fill_pose(triangles.pose, np.zeros(3))
     triangles.points.extend(Point3(x=x, y=y, z=z) for x, y, z in np.asarray(estimate.positions, float).tolist())
     colours = stiffness_colours(np.asarray(estimate.mean, float)).tolist()
     triangles.colors.extend(Color(r=r, g=g, b=b, a=1.0) for r, g, b in colours)

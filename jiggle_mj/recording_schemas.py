@@ -27,6 +27,8 @@ from jiggle_mj.observation import ToolState
 
 WORLD = "world"
 CAMERA_FRAMES = {"left": "camera_left_optical", "right": "camera_right_optical"}
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+"""The quaternion wxyz of no rotation."""
 FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 """zlib level 1: a third of the time of the default for a tenth more bytes; the MCAP chunk is compressed besides."""
 
@@ -171,7 +173,7 @@ def parse_transform(message: FrameTransform | Pose) -> Float[np.ndarray, "4 4"]:
     position = np.array([translation.x, translation.y, translation.z])
     quat_wxyz = np.array([rotation.w, rotation.x, rotation.y, rotation.z])
     if not quat_wxyz.any():
-        quat_wxyz = np.array([1.0, 0, 0, 0])
+        quat_wxyz = UNTURNED
     refuse_bad_pose(position, quat_wxyz)
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
@@ -194,8 +196,7 @@ def refuse_bad_pose(position: Float[np.ndarray, " 3"], quat_wxyz: Float[np.ndarr
 def pose_message(time: int, tool: ToolState) -> PoseInFrame:
     """The tip's pose in the world."""
     message = PoseInFrame(timestamp=timestamp(time), frame_id=WORLD)
-    _fill(message.pose.position, "xyz", tool.position)
-    _fill(message.pose.orientation, "wxyz", tool.quat_wxyz)
+    fill_pose(message.pose, tool.position, tool.quat_wxyz)
     return message
 
 
@@ -240,7 +241,7 @@ def point_cloud(time: int, columns: dict[str, np.ndarray], *, frame_id: str = WO
     message = PointCloud(
         timestamp=timestamp(time), frame_id=frame_id, point_stride=table.dtype.itemsize, data=table.tobytes()
     )
-    message.pose.orientation.w = 1.0
+    fill_pose(message.pose, np.zeros(3))
     for name, (dtype, offset, *_) in (table.dtype.fields or {}).items():
         message.fields.add(name=name, offset=offset, type=FIELD_TYPES[dtype.str])
     return message
@@ -272,6 +273,12 @@ def parse_points(message: PointCloud, topic: str) -> dict[str, np.ndarray]:
     return {name: table[name].copy() for name in known}
 
 
+def fill_pose(pose: Pose, position: Float[np.ndarray, " 3"], quat_wxyz: Float[np.ndarray, " 4"] = UNTURNED) -> None:
+    """Fill in a pose, zeros included: a viewer takes a part that is not there for one that is missing."""
+    _fill(pose.position, "xyz", position)
+    _fill(pose.orientation, "wxyz", quat_wxyz)
+
+
 def _packable(name: str, column: np.ndarray) -> np.ndarray:
     column = np.asarray(column)
     if column.dtype == bool:
@@ -285,5 +292,6 @@ def _packable(name: str, column: np.ndarray) -> np.ndarray:
 
 
 def _fill(message: Any, names: str, values: np.ndarray) -> None:
+    message.SetInParent()
     for name, value in zip(names, values, strict=True):
         setattr(message, name, float(value))

@@ -18,7 +18,7 @@ from mcap.records import Attachment, Channel, Message, Metadata
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.mcap_files import McapOutput, iterate_records, read_arrays
 from jiggle_mj.recording_declaration import METADATA, file_metadata
-from jiggle_mj.recording_schemas import WORLD, parse_points, point_cloud, timestamp
+from jiggle_mj.recording_schemas import WORLD, fill_pose, parse_points, point_cloud, timestamp
 from jiggle_mj.truth import Truth, TruthFrame
 
 REST, POINTS, TOOL, FRAME = "/truth/rest", "/truth/points", "/truth/tool", "/truth/frame"
@@ -79,8 +79,7 @@ class TruthWriter:
         columns = dict(zip("xyz", np.asarray(frame.positions, float).T, strict=True))
         output.message(POINTS, time, point_cloud(time, columns | {"stiffness": np.asarray(frame.stiffness, float)}))
         tool = PoseInFrame(timestamp=timestamp(time), frame_id=WORLD)
-        tool.pose.position.x, tool.pose.position.y, tool.pose.position.z = (float(value) for value in frame.tip)
-        tool.pose.orientation.w = 1.0
+        fill_pose(tool.pose, frame.tip)
         output.message(TOOL, time, tool)
         output.json(FRAME, time, {"index": int(frame.index)}, schema=FRAME_SCHEMA)
         output.flush()

@@ -1,9 +1,9 @@
 """The reference tissue: a MuJoCo shell held to a bed, a tweezer, and a stereo camera. The truth lives here.
 
-    scene = load_scene("arc")
-    with Reference(scene, seed=0, sensing="stereo") as reference:
-        for action in programme(scene):
-            observation = reference.step(action)
+scene = load_scene("arc")
+with Reference(scene, seed=0, sensing="stereo") as reference:
+    for action in programme(scene):
+        observation = reference.step(action)
 """
 
 from jiggle_mj.scenes import opengl as opengl  # before anything that imports mujoco

@@ -10,9 +10,9 @@ from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
+from jiggle_mj.scenes.section import Section, number, points, stiffness, vector
 
 from jiggle_mj.errors import SceneError
-from jiggle_mj.scenes.section import Section, number, points, stiffness, vector
 
 
 def _distance_to_segment(
@@ -143,7 +143,7 @@ def vertex_stiffness(
             x, y = vertices[clash[0]]
             raise SceneError(
                 f"attachments[{owner[clash[0]]}] and attachments[{number_}] give the vertex at ({x:.4f}, {y:.4f}) m "
-                f"two stiffnesses, {total[clash[0]]:g} and {shape.stiffness:g} N/m: make them equal, or move them apart."
+                f"two stiffnesses, {total[clash[0]]:g} and {shape.stiffness:g} N/m: make them equal or part them."
             )
         total[inside], owner[inside] = shape.stiffness, number_
     return total

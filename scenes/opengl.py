@@ -15,7 +15,7 @@ IMPORT_ERROR: Exception | None = None
 """Why the backend's libraries could not be loaded; None if they were."""
 
 try:
-    import mujoco  # noqa: F401
+    import mujoco
 except (AttributeError, ImportError, OSError) as error:
     IMPORT_ERROR = error
     os.environ["MUJOCO_GL"] = "disabled"
@@ -24,9 +24,11 @@ except (AttributeError, ImportError, OSError) as error:
     os.environ["MUJOCO_GL"] = BACKEND
 
 
-def no_opengl(reason: BaseException | str) -> str:
-    """What to tell someone whose machine has no offscreen OpenGL."""
+def no_opengl(error: Exception) -> str:
+    """What to tell someone whose machine has no offscreen OpenGL, in one line."""
+    cause = error.__cause__ or error
+    reason = (str(cause).splitlines() or [type(cause).__name__])[0].rstrip(".")
     return (
-        f"No offscreen OpenGL: MUJOCO_GL={BACKEND} failed ({IMPORT_ERROR or reason}). Install libegl1 libgl1 "
+        f"No offscreen OpenGL: MUJOCO_GL={BACKEND} failed ({reason}). Install libegl1 libgl1 "
         "libgl1-mesa-dri, or set MUJOCO_GL=osmesa with libosmesa6; see 'jiggle-mj doctor'."
     )

@@ -7,9 +7,9 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from jiggle_mj.scenes.scene import Scene
 
 from jiggle_mj.observation import Action, Grasp, Move, Release, Wait
-from jiggle_mj.scenes.scene import Scene
 
 
 def grasp_points(scene: Scene) -> tuple[tuple[float, float], ...]:

@@ -12,15 +12,15 @@ from typing import Literal, Self
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
-
-from jiggle_mj.camera import StereoCamera
-from jiggle_mj.observation import Action, Declaration, Grasp, Move, Observation, Release, ToolState, Wait
 from jiggle_mj.scenes import sensing as sense
 from jiggle_mj.scenes.scene import Scene
 from jiggle_mj.scenes.scene_file import scene_table
-from jiggle_mj.scenes.simulation import check_state, settle
+from jiggle_mj.scenes.simulation import AT_REST, SETTLED, check_state, settle
 from jiggle_mj.scenes.stereo import StereoRenderer, stereo_camera
-from jiggle_mj.scenes.tissue import PARKED, TIMESTEP, build_tissue
+from jiggle_mj.scenes.tissue import TIMESTEP, build_tissue
+
+from jiggle_mj.camera import StereoCamera
+from jiggle_mj.observation import Action, Declaration, Grasp, Move, Observation, Release, ToolState, Wait
 from jiggle_mj.truth import Truth, TruthFrame
 
 SENSING = ("stereo", "points", "particles")
@@ -50,15 +50,13 @@ class Reference:
             raise ValueError(f"sensing = {sensing!r}: must be one of {', '.join(map(repr, SENSING))}.")
         self.scene, self.sensing = scene, sensing
         self._dump_dir = dump_dir
-        self._tissue = build_tissue(scene)
+        self._tissue = build_tissue(scene, drawn=sensing == "stereo")
         self._data = mujoco.MjData(self._tissue.model)
         mujoco.mj_forward(self._tissue.model, self._data)
         self._rng = np.random.default_rng([scene.seed, seed])
         self._tracks = {
             "particles": lambda: sense.vertex_tracks(self._tissue.sheet, rng=self._rng),
-            "points": lambda: sense.material_tracks(
-                self._tissue.sheet, n_points=scene.sensing.n_points, rng=self._rng
-            ),
+            "points": lambda: sense.material_tracks(self._tissue.sheet, n_points=scene.sensing.n_points, rng=self._rng),
             "stereo": lambda: None,
         }[sensing]()
         self._index, self._grasp, self._radius, self._closed = -1, 0, scene.tweezer.radius, False
@@ -66,7 +64,7 @@ class Reference:
         """Indices of observations taken before the tissue was at rest."""
         self._renderer = StereoRenderer(self._tissue.model, scene.camera) if sensing == "stereo" else None
         self._set_jaws(OPEN_ANGLE)
-        self._settle()
+        self._settle(speed=AT_REST)
         self._data.time = 0.0
         self._rest = self._surface()
         self._frames: list[TruthFrame] = []
@@ -194,8 +192,8 @@ class Reference:
 
     # Time
 
-    def _settle(self) -> bool:
-        settled = settle(self._tissue.model, self._data, dump_dir=self._dump_dir)
+    def _settle(self, *, speed: float = SETTLED) -> bool:
+        settled = settle(self._tissue.model, self._data, speed=speed, dump_dir=self._dump_dir)
         mujoco.mj_forward(self._tissue.model, self._data)
         return settled
 
@@ -233,9 +231,7 @@ class Reference:
         settings = self.scene.sensing
         images = points = None
         if self._renderer is not None:
-            images = sense.add_image_noise(
-                self._renderer.render(self._data), sd=settings.image_sd, rng=self._rng
-            )
+            images = sense.add_image_noise(self._renderer.render(self._data), sd=settings.image_sd, rng=self._rng)
         if self._tracks is not None:
             points = sense.measure(self._tracks.positions(self._surface()), sd=settings.point_sd, rng=self._rng)
         return Observation(index=self._index, time=self._time, tool=self._tool(), images=images, points=points)

@@ -7,10 +7,11 @@ degrees and their names say so. Nothing here touches MuJoCo.
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from jiggle_mj.errors import SceneError
-from jiggle_mj.observation import Declaration
 from jiggle_mj.scenes.attachments import Attachment
 from jiggle_mj.scenes.section import Section, choice, integer, number, points, switch, vector
+
+from jiggle_mj.errors import SceneError
+from jiggle_mj.observation import Declaration
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,6 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from jiggle_mj.errors import SceneError
 from jiggle_mj.scenes.attachments import SHAPES, Attachment
 from jiggle_mj.scenes.scene import (
     Bed,
@@ -24,6 +23,8 @@ from jiggle_mj.scenes.scene import (
     Tweezer,
 )
 from jiggle_mj.scenes.section import Section, checked
+
+from jiggle_mj.errors import SceneError
 
 SECTIONS: dict[str, type[Section]] = {
     cls.section: cls for cls in (Tissue, Bed, Tweezer, Programme, Camera, Lights, Texture, Sensing, Declared)
@@ -106,9 +107,7 @@ def scene_table(scene: Scene) -> dict[str, Any]:
     """The scene as a table that could stand in a scene file; every key is written out."""
     table: dict[str, Any] = {"seed": scene.seed}
     shape_names = {cls: shape for shape, cls in SHAPES.items()}
-    table["attachments"] = [
-        {"shape": shape_names[type(shape)], **_plain(shape)} for shape in scene.attachments
-    ]
+    table["attachments"] = [{"shape": shape_names[type(shape)], **_plain(shape)} for shape in scene.attachments]
     return table | {key: _plain(getattr(scene, key)) for key in SECTIONS}
 
 

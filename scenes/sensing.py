@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from jiggle_mj.scenes.mesh import Triangulation, lattice
 
 from jiggle_mj.observation import MeasuredPoints, StereoPair
-from jiggle_mj.scenes.mesh import Triangulation, lattice
 
 POINT_JITTER = 0.25
 """Largest displacement of a material point from its lattice place, in lattice spacings."""

@@ -15,6 +15,8 @@ from jiggle_mj.errors import SimulationError
 
 SETTLED = 1e-3
 """Largest speed of a settled coordinate [m/s]."""
+AT_REST = 1e-5
+"""Before the first frame [m/s]: still frames are to show the noise of sensing, not the last of the settling."""
 MAX_STEPS = 400
 """After these a state counts as capped, not settled."""
 MAX_COORDINATE, MAX_SPEED = 2.0, 50.0
@@ -32,8 +34,8 @@ def _count(text: str) -> None:
 mujoco.set_mju_user_warning(_count)
 
 
-def settle(model: mujoco.MjModel, data: mujoco.MjData, *, dump_dir: Path | None = None) -> bool:
-    """Step until at rest; False if the cap of `MAX_STEPS` came first.
+def settle(model: mujoco.MjModel, data: mujoco.MjData, *, speed: float = SETTLED, dump_dir: Path | None = None) -> bool:
+    """Step until every coordinate is slower than `speed` [m/s]; False if the cap of `MAX_STEPS` came first.
 
     Raises:
         SimulationError: the state became unstable; its dump is named.
@@ -41,7 +43,7 @@ def settle(model: mujoco.MjModel, data: mujoco.MjData, *, dump_dir: Path | None 
     for _ in range(MAX_STEPS):
         mujoco.mj_step(model, data)
         check_state(model, data, dump_dir=dump_dir)
-        if np.abs(data.qvel).max() < SETTLED:
+        if np.abs(data.qvel).max() < speed:
             return True
     return False
 
@@ -57,9 +59,7 @@ def check_state(model: mujoco.MjModel, data: mujoco.MjData, *, dump_dir: Path | 
         return
     folder = dump_dir if dump_dir is not None else Path(tempfile.mkdtemp(prefix="jiggle-mj-"))
     path = folder / "unstable_state.npz"
-    np.savez(
-        path, qpos=data.qpos, qvel=data.qvel, time=data.time, mocap_pos=data.mocap_pos, eq_active=data.eq_active
-    )
+    np.savez(path, qpos=data.qpos, qvel=data.qvel, time=data.time, mocap_pos=data.mocap_pos, eq_active=data.eq_active)
     raise SimulationError(
         f"the simulation became unstable at t = {data.time:.2f} s (largest coordinate {size:.3g} m, speed "
         f"{speed:.3g} m/s); the state is in {path}. Lower tissue.young or the attachments' stiffness, or raise "

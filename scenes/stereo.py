@@ -8,12 +8,12 @@ import math
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
+from jiggle_mj.scenes.opengl import IMPORT_ERROR, no_opengl
+from jiggle_mj.scenes.scene import Camera
 
 from jiggle_mj.camera import StereoCamera, optical_from_opengl
 from jiggle_mj.errors import RenderError
 from jiggle_mj.observation import StereoPair
-from jiggle_mj.scenes.opengl import IMPORT_ERROR, no_opengl
-from jiggle_mj.scenes.scene import Camera
 
 NAMES = ("left", "right")
 
@@ -80,4 +80,3 @@ class StereoRenderer:
     def close(self) -> None:
         """Free the OpenGL context."""
         self._renderer.close()
-

@@ -50,7 +50,9 @@ def tissue_texture(*, seed: int, resolution: int, contrast: float) -> UInt8[np.n
     shade = smooth_noise(rng, resolution, (2 * unit, 4 * unit, 8 * unit, 20 * unit, 60 * unit))
     hue = smooth_noise(rng, resolution, (12 * unit, 40 * unit))
     opacity = 0.75 * vessels(rng, resolution)[..., None]
-    flesh = TISSUE_RGB * (1 + contrast * 0.13 * shade[..., None]) + contrast * 7 * hue[..., None] * np.array([0, 1, 0.6])
+    flesh = TISSUE_RGB * (1 + contrast * 0.13 * shade[..., None]) + contrast * 7 * hue[..., None] * np.array(
+        [0, 1, 0.6]
+    )
     image = flesh * (1 - contrast * opacity) + VESSEL_RGB * contrast * opacity
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
 

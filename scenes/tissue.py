@@ -12,10 +12,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from jaxtyping import Float, Int
-
 from jiggle_mj.scenes.attachments import vertex_stiffness
 from jiggle_mj.scenes.mesh import Triangulation, build_sheet
-from jiggle_mj.scenes.scene import Scene
+from jiggle_mj.scenes.scene import Scene, Texture
 from jiggle_mj.scenes.stereo import add_cameras
 from jiggle_mj.scenes.texture import bed_texture, tissue_texture
 
@@ -27,6 +26,8 @@ CONTACT_SOLREF, CONTACT_SOLIMP = (-2e3, -100.0), (0.99, 0.999, 1e-4, 0.5, 2.0)
 """Of the bed: a vertex weighs 16 mg, so MuJoCo's default lets a pull of 1 mN sink it by millimetres."""
 STRETCH_AND_BEND = 3
 """MuJoCo's `elastic2d="both"`."""
+PLAIN = Texture(resolution=64, contrast=0.0)
+"""Stands in where nothing is drawn."""
 TWEEZER = Path(__file__).parent / "tweezer.xml"
 PARKED = (0.0, 0.0, 0.5)
 """Where the tweezer waits, out of sight [m]."""
@@ -53,8 +54,8 @@ class TissueModel:
         return self.model.jnt_qposadr[self.joints]
 
 
-def build_tissue(scene: Scene) -> TissueModel:
-    """Compile a scene.
+def build_tissue(scene: Scene, *, drawn: bool = True) -> TissueModel:
+    """Compile a scene; without `drawn` the textures, which cost a second, are left plain.
 
     Raises:
         SceneError: attachments that hold no vertex or contradict each other.
@@ -66,7 +67,7 @@ def build_tissue(scene: Scene) -> TissueModel:
     spec = mujoco.MjSpec()
     spec.modelname = scene.name
     _set_options(spec, scene)
-    _add_looks(spec, scene)
+    _add_looks(spec, scene, drawn=drawn)
     if scene.bed.present:
         _add_bed(spec, scene)
     _add_sheet(spec, scene, sheet, stiffness)
@@ -93,6 +94,7 @@ def _set_options(spec: mujoco.MjSpec, scene: Scene) -> None:
     spec.option.solver = mujoco.mjtSolver.mjSOL_CG
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.timestep = TIMESTEP
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.option.iterations = 200
     spec.option.tolerance = 1e-7
     spec.visual.quality.shadowsize = 0
@@ -106,8 +108,8 @@ def _set_options(spec: mujoco.MjSpec, scene: Scene) -> None:
         setattr(spec.visual.headlight, colour, [scene.lights.ambient if colour == "ambient" else 0.0] * 3)
 
 
-def _add_looks(spec: mujoco.MjSpec, scene: Scene) -> None:
-    texture = scene.texture
+def _add_looks(spec: mujoco.MjSpec, scene: Scene, *, drawn: bool) -> None:
+    texture = scene.texture if drawn else PLAIN
     looks = {"tissue": tissue_texture, "bed": bed_texture}
     for name, draw in looks.items():
         image = draw(seed=texture.seed, resolution=texture.resolution, contrast=texture.contrast)

@@ -85,7 +85,7 @@ def imports(path: Path, name: str) -> Iterator[tuple[int, str]]:
             base = ".".join([*parents, *([node.module] if node.module else [])])
             yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in {"import_module", "importlib.import_module"}:
-            yield from ((node.lineno, a.value) for a in node.args[:1] if isinstance(a, ast.Constant))
+            yield from ((node.lineno, str(a.value)) for a in node.args[:1] if isinstance(a, ast.Constant))
 
 
 def layer(name: str) -> str:

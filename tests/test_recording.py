@@ -26,7 +26,7 @@ from jiggle_mj.observation import (
     ToolState,
 )
 from jiggle_mj.recording import Recording, RecordingWriter
-from jiggle_mj.recording_contents import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
+from jiggle_mj.recording_contents import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, SCHEMAS, TF
 from jiggle_mj.recording_frames import camera_transforms
 from jiggle_mj.recording_moments import Stamped, group_moments
 from jiggle_mj.recording_schemas import (
@@ -226,6 +226,7 @@ def test_foxglove_fields_are_filled_and_the_file_is_sound(tmp_path):
     assert calibration.distortion_model == "plumb_bob" and calibration.P[3] == pytest.approx(-40 * 0.005)
     assert messages[LEFT][1].format == "png" and messages[LEFT][1].data[1:4] == b"PNG"
     cloud = messages[POINTS][1]
+    assert cloud.pose.HasField("position"), "Rerun takes an absent position for a null one"
     assert cloud.point_stride * 5 == len(cloud.data) and cloud.pose.orientation.w == 1
     assert [f.name for f in cloud.fields] == ["x", "y", "z", "track_id", "sd"]
     transforms = messages[TF][1].transforms
@@ -644,3 +645,8 @@ def test_observations_are_no_truth(tmp_path):
     path = write(tmp_path / "run.mcap", observations(1))
     with pytest.raises(RecordingError, match="is not a truth file"):
         read_truth(path)
+
+
+def test_the_documentation_names_every_topic():
+    text = (Path(__file__).parents[1] / "docs" / "RECORDINGS.md").read_text()
+    assert [topic for topic in (*SCHEMAS, GRASP) if f"`{topic}`" not in text] == []

@@ -1,19 +1,19 @@
 """The reference tissue: forces, grasps, determinism, and what it refuses. A small sheet keeps the tests quick."""
 
 import dataclasses
+import itertools
 import json
 import math
 
 import mujoco
 import numpy as np
 import pytest
+from jiggle_mj.scenes import Reference, Scene, programme, simulation
+from jiggle_mj.scenes.attachments import Disc
+from jiggle_mj.scenes.scene import Bed, Programme, Tissue, Tweezer
 
 from jiggle_mj.errors import SimulationError
 from jiggle_mj.observation import Grasp, Move, Release, Wait
-from jiggle_mj.scenes import Reference, Scene, programme
-from jiggle_mj.scenes import simulation
-from jiggle_mj.scenes.attachments import Disc
-from jiggle_mj.scenes.scene import Bed, Programme, Tissue, Tweezer
 
 TISSUE = Tissue(size=(0.06, 0.06), spacing=6e-3)
 MIDDLE = Disc(centre=(0.0, 0.0), radius=0.012, stiffness=1.0)
@@ -91,7 +91,7 @@ def test_forces_balance_at_rest_while_lifted():
     """Springs + weight + grip + bed = 0 within 2 % of the weight, since rest means 1 mm/s, not 0."""
     reference = particles()
     reference.step(Grasp(point=CORNER, radius=8e-3))
-    reference.step(Move(to=CORNER + [0.0, 0.0, 0.02]))
+    reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.02])))
     reference.step(Wait())
     weight = TISSUE.density * TISSUE.thickness * np.prod(TISSUE.size) * 9.81
     assert np.abs(net_force(reference)).max() < 0.02 * weight
@@ -118,7 +118,7 @@ def test_an_attached_vertex_can_be_held_too():
     reference.step(Grasp(point=point, radius=5e-3))
     both = reference.held & reference.truth().attached
     before = reference.truth_frame().positions
-    reference.step(Move(to=point + [0.0, 0.0, 0.01]))
+    reference.step(Move(to=point + np.array([0.0, 0.0, 0.01])))
     assert both.any()
     assert np.abs((reference.truth_frame().positions - before)[both, 2] - 0.01).max() < 1e-3
 
@@ -128,7 +128,7 @@ def test_a_weld_stays_where_it_is_while_a_corner_is_lifted():
     reference = particles(dataclasses.replace(SCENE, attachments=(weld,)))
     rest = reference.truth().rest
     reference.step(Grasp(point=CORNER, radius=8e-3))
-    reference.step(Move(to=CORNER + [0.0, 0.0, 0.02]))
+    reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.02])))
     attached = reference.truth().attached
     moved = np.linalg.norm(reference._data.flexvert_xpos - rest + [0, 0, TISSUE.radius], axis=1)
     # Measured 0.2 mm where the pull is strongest: the constraint is stiff, not rigid.
@@ -195,7 +195,7 @@ def test_observations_are_numbered_and_timed_from_zero():
     observations = [reference.step(action) for action in list(programme(SCENE))[:4]]
     assert [o.index for o in observations] == [0, 1, 2, 3]
     assert observations[0].time >= 0
-    assert all(later.time > earlier.time for earlier, later in zip(observations, observations[1:], strict=False))
+    assert all(later.time > earlier.time for earlier, later in itertools.pairwise(observations))
     assert [(o.tool.closed, o.tool.grasp) for o in observations] == [(False, 0), (False, 0), (True, 1), (True, 1)]
 
 
@@ -235,12 +235,14 @@ def test_an_unstable_state_is_dumped_and_named(tmp_path):
     assert np.isnan(np.load(tmp_path / "unstable_state.npz")["qpos"][7])
 
 
-def test_mujocos_warnings_are_counted_and_write_no_file(tmp_path, monkeypatch):
+def test_mujocos_warnings_are_counted_and_write_no_file(tmp_path, tmp_path_factory, monkeypatch):
+    dumps = tmp_path_factory.mktemp("dumps")
     monkeypatch.chdir(tmp_path)
     before = sum(simulation.warnings.values())
-    reference = particles()
-    reference.step(Grasp(point=CORNER, radius=8e-3))
-    reference.step(Move(to=CORNER + [0.0, 0.0, 0.02]))
+    reference = Reference(SCENE, seed=0, sensing="particles", dump_dir=dumps)
+    reference._data.qpos[0] = np.nan
+    with pytest.raises(SimulationError):
+        reference.step(Wait())
     assert list(tmp_path.iterdir()) == []
     assert sum(simulation.warnings.values()) > before
 
@@ -252,7 +254,7 @@ def test_the_tweezer_touches_nothing_and_its_jaws_close():
     tool = {i for i in range(model.ngeom) if model.geom(i).name.startswith("tweezer/")}
     wide = [data.qpos[model.jnt_qposadr[j]] for j in reference._tissue.jaws]
     reference.step(Grasp(point=CORNER, radius=8e-3))
-    reference.step(Move(to=CORNER + [0.0, 0.0, 0.01]))
+    reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.01])))
     narrow = [data.qpos[model.jnt_qposadr[j]] for j in reference._tissue.jaws]
     assert tool and not tool & set(data.contact.geom.ravel().tolist())
     assert min(wide) > 0.2 and max(np.abs(narrow)) < 0.02

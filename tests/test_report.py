@@ -304,7 +304,7 @@ def chromium(page: Path, profile: Path, *more: str) -> subprocess.CompletedProce
 @pytest.mark.skipif(not CHROMIUM, reason="no chromium on PATH to open the page in")
 @pytest.mark.parametrize(("truth", "images"), [(True, True), (False, False)])
 def test_the_page_runs_in_chromium_without_a_console_error(tmp_path, truth, images):
-    """The script marks the page ready as its last act, each figure is drawn, the slider moves, the console is silent."""
+    """Each figure is drawn, the slider moves, the script reaches its last line, and the console is silent."""
     path = tmp_path / "report.html"
     path.write_text(write(path, truth=truth, images=images) + MOVE_THE_SLIDER, "utf-8")
     shown = chromium(path, tmp_path / "profile", "--dump-dom")

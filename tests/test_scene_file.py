@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from jiggle_mj.errors import SceneError
 from jiggle_mj.scenes import Scene, load_scene, scene_table, shipped_scenes
 from jiggle_mj.scenes.attachments import vertex_stiffness
 from jiggle_mj.scenes.mesh import build_sheet
 from jiggle_mj.scenes.programme import grasp_points
 from jiggle_mj.scenes.scene import Tissue
 from jiggle_mj.scenes.scene_file import scene_from_table
+
+from jiggle_mj.errors import SceneError
 
 PAPER_COUNTS = {"line": 30, "arc": 54, "line_dot": 98, "arc_line": 110, "u_shape": 104}
 """Attached particles of the shapes in Shinde et al. 2024 (arXiv 2405.09743), as the project's brief lists them."""
@@ -143,7 +143,7 @@ def test_a_scene_built_in_python_is_checked_like_a_file():
 
 
 def test_an_unknown_name_lists_the_shipped_scenes():
-    with pytest.raises(SceneError, match="no scene named 'ark'.*arc, arc_line, free"):
+    with pytest.raises(SceneError, match=r"no scene named 'ark'.*arc, arc_line, free"):
         load_scene("ark")
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from jiggle_mj.errors import MeshError, SceneError
 from jiggle_mj.scenes.attachments import Arc, Disc, Polygon, Segment, vertex_stiffness
 from jiggle_mj.scenes.mesh import build_sheet, check_sheet, triangle_areas
 from jiggle_mj.scenes.sensing import material_tracks, vertex_tracks
+
+from jiggle_mj.errors import MeshError, SceneError
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
@@ -79,7 +79,10 @@ PLACES = np.array([[0.0, 0.0], [0.02, 0.0], [0.0, 0.02], [-0.02, 0.0], [0.03, 0.
 @pytest.mark.parametrize(
     ("shape", "distances"),
     [
-        (Segment(start=(0.0, 0.0), end=(0.02, 0.0), width=0.01, stiffness=1.0), [0, 0, 0.02, 0.02, math.hypot(0.01, 0.004)]),
+        (
+            Segment(start=(0.0, 0.0), end=(0.02, 0.0), width=0.01, stiffness=1.0),
+            [0, 0, 0.02, 0.02, math.hypot(0.01, 0.004)],
+        ),
         (
             Arc(centre=(0.0, 0.0), radius=0.02, start_deg=0.0, end_deg=90.0, width=0.01, stiffness=1.0),
             [0.02, 0, 0, math.hypot(0.02, 0.02), math.hypot(0.03, 0.004) - 0.02],
@@ -96,9 +99,7 @@ def test_distances_to_shapes_are_the_geometers(shape, distances):
 
 
 def test_shapes_unite_and_free_vertices_stay_free():
-    shapes = tuple(
-        Disc(centre=(x, 0.0), radius=0.001, stiffness=k) for x, k in ((0.0, 2.0), (0.02, math.inf))
-    )
+    shapes = tuple(Disc(centre=(x, 0.0), radius=0.001, stiffness=k) for x, k in ((0.0, 2.0), (0.02, math.inf)))
     assert vertex_stiffness(shapes, PLACES).tolist() == [2.0, math.inf, 0.0, 0.0, 0.0]
 
 

@@ -8,13 +8,13 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from jiggle_mj.scenes import Reference, Scene, load_scene
+from jiggle_mj.scenes.scene import Camera, Sensing, Texture
+from jiggle_mj.scenes.stereo import StereoRenderer, add_cameras, stereo_camera
+from jiggle_mj.scenes.texture import bed_texture, tissue_texture
 
 from jiggle_mj.errors import RenderError
 from jiggle_mj.observation import Grasp, Move, Release, Wait
-from jiggle_mj.scenes import Reference, Scene, load_scene
-from jiggle_mj.scenes.scene import Camera, Sensing
-from jiggle_mj.scenes.stereo import StereoRenderer, add_cameras, stereo_camera
-from jiggle_mj.scenes.texture import bed_texture, tissue_texture
 
 MARKER_RADIUS = 2.5e-3
 """[m]; about nine pixels, so that a centroid averages the edge's sampling out to a few hundredths."""
@@ -54,7 +54,8 @@ def test_a_marker_is_drawn_where_the_calibration_projects_it(camera):
 @pytest.fixture(scope="module")
 def arc() -> Scene:
     scene = load_scene("arc")
-    return dataclasses.replace(scene, sensing=Sensing(image_sd=0.0))
+    coarse = dataclasses.replace(scene.tissue, spacing=8e-3)
+    return dataclasses.replace(scene, tissue=coarse, texture=Texture(resolution=512), sensing=Sensing(image_sd=0.0))
 
 
 @pytest.mark.render
@@ -77,22 +78,26 @@ def test_the_lifted_sheet_stays_in_view_and_apart_from_bed_and_tool_by_its_colou
         for corner in ([-0.047, -0.047, 4e-4], [0.047, 0.047, 4e-4]):
             point = np.array(corner)
             reference.step(Grasp(point=point, radius=7e-3))
-            image = reference.step(Move(to=point + [-0.1 * point[0], -0.1 * point[1], 0.042])).images.left.astype(int)
+            top = np.array([0.9 * point[0], 0.9 * point[1], 0.042])
+            image = reference.step(Move(to=top)).images.left.astype(int)
             uvd = reference.camera.project(reference.truth_frame().positions)
             inside = (uvd[:, :2] >= 0).all(axis=1) & (uvd[:, 0] <= 639) & (uvd[:, 1] <= 479)
             assert inside.mean() > 0.99
             red = image[..., 0] > image[..., 2] + 8
-            pixels = np.round(uvd[inside, :2]).astype(int)
+            inner = np.abs(reference.truth().rest[:, :2]).max(axis=1) < 0.046
+            pixels = np.round(uvd[inside & inner, :2]).astype(int)
             assert red[pixels[:, 1], pixels[:, 0]].mean() > 0.95
             assert red.mean() < 0.6
             reference.step(Move(to=point))
             reference.step(Release())
 
 
-
 @pytest.mark.render
 def test_image_noise_has_the_stated_sd_and_the_same_seed_gives_the_same_image(arc):
-    """Difference of two still frames: variance 2 sd^2, plus 1/6 for rounding twice; clipped channels left out."""
+    """Difference of two still frames: variance 2 sd^2, plus 1/6 for rounding twice; clipped channels left out.
+
+    The tissue still creeps by 1 um a frame, which turns over a few pixels on edges: 2 % is left for them.
+    """
     noisy = dataclasses.replace(arc, sensing=Sensing(image_sd=2.0))
 
     def frames(seed: int) -> list[np.ndarray]:
@@ -136,8 +141,9 @@ except RenderError as error:
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "MUJOCO_GL": "egl"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("No offscreen OpenGL: MUJOCO_GL=egl failed (libEGL.so.1 not found). Install libegl1")
-    assert "jiggle-mj doctor" in done.stdout
+    assert done.stdout.count("\n") == 1
+    assert done.stdout.startswith("No offscreen OpenGL: MUJOCO_GL=egl failed (")
+    assert "libEGL.so.1 not found). Install libegl1" in done.stdout and "jiggle-mj doctor" in done.stdout
 
 
 def test_a_context_that_cannot_be_made_is_a_render_error(monkeypatch):

@@ -113,7 +113,7 @@ def set_up_opengl(python: Path) -> None:
 
 def main() -> None:
     """Do each step that is still to be done."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Set up this checkout.")
     parser.add_argument("--venv", type=Path, default=ROOT / ".venv", help="where the virtual environment goes")
     venv = parser.parse_args().venv.resolve()
     python = make_environment(venv)

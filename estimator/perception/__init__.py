@@ -5,7 +5,9 @@ Data flow: `rectified` -> `tissue_mask`, `disparity` -> `sheet_mesh` -> (`materi
 """
 
 from jiggle_mj.estimator.perception.disparity import Disparity, SemiGlobalMatching
-from jiggle_mj.estimator.perception.stereo_tracker import StereoTracker, Track
+from jiggle_mj.estimator.perception.point_tracker import PointTracker
+from jiggle_mj.estimator.perception.stereo_tracker import StereoTracker
 from jiggle_mj.estimator.perception.tissue_mask import TissueMask, WarmTissue
+from jiggle_mj.estimator.perception.track import Track
 
-__all__ = ["Disparity", "SemiGlobalMatching", "StereoTracker", "TissueMask", "Track", "WarmTissue"]
+__all__ = ["Disparity", "PointTracker", "SemiGlobalMatching", "StereoTracker", "TissueMask", "Track", "WarmTissue"]

@@ -13,13 +13,14 @@ from jaxtyping import Float, UInt8
 
 from jiggle_mj.camera import CameraCalibration, StereoCamera
 from jiggle_mj.errors import PerceptionError
+from jiggle_mj.estimator.perception.resampling import double
 from jiggle_mj.observation import StereoPair
 
 DARK = 8.0
 """An image is black when even its 99th percentile stays below this grey value of 255 (sensor noise is 1 to 3)."""
 
-SMOOTHING = 0.8
-"""Standard deviation of the Gaussian on the grey images [px]: without it, resampling locks matches to whole pixels."""
+SMOOTHING = 0.6
+"""Standard deviation of the Gaussian on the grey images [px]: quiets noise and aliasing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +35,10 @@ class RectifiedPair:
     """0 to 255, float32, lightly smoothed."""
     right_grey: Float[np.ndarray, "height width"]
     """0 to 255, float32, lightly smoothed."""
+    left_fine: Float[np.ndarray, "doubled_height doubled_width"]
+    """The left grey image at half-pixel spacing."""
+    right_fine: Float[np.ndarray, "doubled_height doubled_width"]
+    """The right grey image at half-pixel spacing."""
 
     @property
     def black_side(self) -> str | None:
@@ -71,7 +76,14 @@ class Rectifier:
             cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), SMOOTHING)
             for image in (left, right)
         ]
-        return RectifiedPair(left=left, right=right, left_grey=grey[0], right_grey=grey[1])
+        return RectifiedPair(
+            left=left,
+            right=right,
+            left_grey=grey[0],
+            right_grey=grey[1],
+            left_fine=double(grey[0]),
+            right_fine=double(grey[1]),
+        )
 
 
 def _maps(calibration: CameraCalibration) -> tuple[np.ndarray, np.ndarray] | None:

@@ -21,6 +21,7 @@ from jiggle_mj.estimator.perception.lucas_kanade import (
 )
 from jiggle_mj.estimator.perception.material_map import MaterialMap
 from jiggle_mj.estimator.perception.mesh_field import MeshField
+from jiggle_mj.estimator.perception.resampling import double, sample_doubled
 
 FINE = 4.0
 """Standard deviation of the matching window [px]."""
@@ -60,7 +61,7 @@ class MaterialRegistration:
 
     def refine(
         self,
-        grey: Float[np.ndarray, "height width"],
+        fine: Float[np.ndarray, "doubled_height doubled_width"],
         tissue: Bool[np.ndarray, "height width"],
         start: Float[np.ndarray, "n 2"],
         *,
@@ -69,17 +70,17 @@ class MaterialRegistration:
         """One step for each window, coarse ones first.
 
         Args:
-            grey: current left image.
+            fine: current left image, doubled.
             tissue: its tissue pixels; nothing else is compared.
             start: guessed current pixel of each particle.
             windows: standard deviations of the matching windows, one a step [px].
         """
         value = start
         for window in windows[:-1]:
-            value, _ = self._advance(grey, tissue, value, window)
+            value, _ = self._advance(fine, tissue, value, window)
         jacobian = self._field.jacobian(value)
-        settled, step = self._advance(grey, tissue, value, windows[-1])
-        warped = self._warp(grey, tissue, settled)
+        settled, step = self._advance(fine, tissue, value, windows[-1])
+        warped = self._warp(fine, tissue, settled)
         information = np.linalg.pinv(step.information, hermitian=True)
         quality = match(self._template, warped, self._material, window=FINE)
         spread = _white_noise(quality, windows[-1]) * (jacobian @ information @ jacobian.transpose(0, 2, 1))
@@ -89,30 +90,30 @@ class MaterialRegistration:
 
     def _advance(
         self,
-        grey: Float[np.ndarray, "height width"],
+        fine: Float[np.ndarray, "doubled_height doubled_width"],
         tissue: Bool[np.ndarray, "height width"],
         value: Float[np.ndarray, "n 2"],
         window: float,
     ) -> tuple[Float[np.ndarray, "n 2"], Step]:
-        step = step_in_plane(self._template, self._warp(grey, tissue, value), self._material, window=window)
+        step = step_in_plane(self._template, self._warp(fine, tissue, value), self._material, window=window)
         shift = np.einsum("nij,nj->ni", self._field.jacobian(value), _shorten(step.shift))
         return value + _settle(self._field, shift, step), step
 
     def _warp(
         self,
-        grey: Float[np.ndarray, "height width"],
+        fine: Float[np.ndarray, "doubled_height doubled_width"],
         tissue: Bool[np.ndarray, "height width"],
         value: Float[np.ndarray, "n 2"],
     ) -> Normalised:
         where = self._material.spread(value)
-        warped = resample(grey, where[..., 0], where[..., 1])
+        warped = sample_doubled(fine, where[..., 0], where[..., 1])
         seen = sample_mask(tissue, where[..., 0], where[..., 1])
         return normalise(warped, self._material.support & seen, width=CONTRAST)
 
 
 def refine_disparity(
-    left: Float[np.ndarray, "height width"],
-    right: Float[np.ndarray, "height width"],
+    left: Float[np.ndarray, "doubled_height doubled_width"],
+    right: Float[np.ndarray, "doubled_height doubled_width"],
     tissue: tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]],
     pixels: Float[np.ndarray, "n 2"],
     start: Float[np.ndarray, " n"],
@@ -124,8 +125,8 @@ def refine_disparity(
     """Disparity of each particle from left and right patches in material coordinates.
 
     Args:
-        left: current left image.
-        right: current right image.
+        left: current left image, doubled.
+        right: current right image, doubled.
         tissue: tissue pixels of the left and of the right image; nothing else is compared.
         pixels: current left pixel of each particle.
         start: guessed disparity [px].
@@ -134,17 +135,17 @@ def refine_disparity(
         windows: standard deviations of the matching windows, one a step [px].
     """
     where = material.spread(pixels)
-    sampled = resample(left, where[..., 0], where[..., 1])
+    sampled = sample_doubled(left, where[..., 0], where[..., 1])
     support = material.support & sample_mask(tissue[0], where[..., 0], where[..., 1])
     first = normalise(sampled, support, width=CONTRAST)
-    slope_left = resample(gradients(left)[0], where[..., 0], where[..., 1])
-    slope = gradients(right)[0]
+    slope_left = sample_doubled(2 * gradients(left)[0], where[..., 0], where[..., 1])
+    slope = 2 * gradients(right)[0]
 
     def warp(value: Float[np.ndarray, "n 1"]) -> tuple[Normalised, Float[np.ndarray, "h w"]]:
         columns = where[..., 0] - material.spread(value)[..., 0]
         seen = support & sample_mask(tissue[1], columns, where[..., 1])
-        second = normalise(resample(right, columns, where[..., 1]), seen, width=CONTRAST)
-        slope_right = resample(slope, columns, where[..., 1])
+        second = normalise(sample_doubled(right, columns, where[..., 1]), seen, width=CONTRAST)
+        slope_right = sample_doubled(slope, columns, where[..., 1])
         return second, -(slope_left + slope_right) / (2 * second.deviation)
 
     def advance(value: Float[np.ndarray, "n 1"], window: float) -> tuple[Float[np.ndarray, "n 1"], Step]:
@@ -159,13 +160,6 @@ def refine_disparity(
     quality = match(first, warp(settled)[0], material, window=FINE)
     spread = _white_noise(quality, windows[-1]) / np.maximum(step.information, 1e-9)
     return Registered(value=settled, match=quality, spread=spread, last_step=np.abs(settled - value)[:, 0])
-
-
-def resample(
-    image: Float[np.ndarray, "height width"], columns: Float[np.ndarray, "h w"], rows: Float[np.ndarray, "h w"]
-) -> Float[np.ndarray, "h w"]:
-    """An image at given pixels, bicubic."""
-    return cv2.remap(image, columns, rows, cv2.INTER_CUBIC)
 
 
 def sample_mask(

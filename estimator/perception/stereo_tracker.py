@@ -26,6 +26,7 @@ from jiggle_mj.estimator.perception.registration import (
 )
 from jiggle_mj.estimator.perception.sheet_mesh import LEAST_MATCHED, DisparitySurface, lay_mesh
 from jiggle_mj.estimator.perception.tissue_mask import TissueMask, WarmTissue, largest_blob
+from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
@@ -45,8 +46,6 @@ DISAGREEMENT = 1.5
 """Refined disparities further than this from the dense one are not believed [px]."""
 SETTLED = 0.3
 """The last step of a registration that has settled is shorter than this [px]."""
-UNSEEN_VARIANCE = 1.0
-"""Variance of a coordinate of a particle that was not seen: as good as unknown [m^2]."""
 LATERAL_SD = 0.08
 """Error of a perfect match: where a particle lies in the first image's tissue, and resampling [px]."""
 DISPARITY_SD = 0.035
@@ -62,19 +61,6 @@ OFF_TREND = 3.0
 """A particle this far from where its neighbours' motion and stretch put it was mistaken for another [px]."""
 SMALLEST_SHEET = 2000
 """Fewest tissue pixels that can be a sheet."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Track:
-    """One frame's measurement of the particles."""
-
-    positions: Float[np.ndarray, "n 3"]
-    """World [m]; NaN where unseen."""
-    covariance: Float[np.ndarray, "n 3 3"]
-    """[m^2]; `UNSEEN_VARIANCE` on the diagonal where unseen."""
-    visible: Bool[np.ndarray, " n"]
-    uvd: Float[np.ndarray, "n 3"]
-    """Left rectified pixel and disparity [px]; the best guess where unseen."""
 
 
 @dataclass(kw_only=True)
@@ -129,8 +115,8 @@ class StereoTracker:
         self._material = MaterialMap(uv, mesh.faces, tissue)
         self._field = MeshField(uv, mesh.faces)
         refined = refine_disparity(
-            pair.left_grey,
-            pair.right_grey,
+            pair.left_fine,
+            pair.right_fine,
             (tissue, self._mask(pair.right)),
             uv,
             mesh.uvd[:, 2],
@@ -147,7 +133,7 @@ class StereoTracker:
         self._first, self._first_uvd = pair.left_grey, uvd
         self._registration = MaterialRegistration(pair.left_grey, self._material, self._field)
         everywhere = np.ones(len(uv), bool)
-        self._whole = self._registration.refine(pair.left_grey, tissue, uv, windows=(FINE,)).match.share
+        self._whole = self._registration.refine(pair.left_fine, tissue, uv, windows=(FINE,)).match.share
         self._last = _Last(grey=pair.left_grey, uvd=uvd, visible=everywhere, tool=tool)
         return Sheet(rest=self._camera.back_project(uvd), faces=mesh.faces)
 
@@ -171,12 +157,12 @@ class StereoTracker:
         tissue, tissue_right = self._mask(pair.left), self._mask(pair.right)
         start = self._guess(pair, tissue, last, tool, self._camera.project(predicted))
         plane = self._registration.refine(
-            pair.left_grey, tissue, start[:, :2], windows=(COARSE, COARSE, FINE, FINE, FINE)
+            pair.left_fine, tissue, start[:, :2], windows=(COARSE, COARSE, FINE, FINE, FINE)
         )
         dense = self._disparity(pair.left, pair.right)
         coarse, sure = self._coarse_disparity(dense, plane.value, start[:, 2])
         depth = refine_disparity(
-            pair.left_grey, pair.right_grey, (tissue, tissue_right), plane.value, coarse, self._material, self._field
+            pair.left_fine, pair.right_fine, (tissue, tissue_right), plane.value, coarse, self._material, self._field
         )
         uvd = np.concatenate([plane.value, depth.value], axis=1)
         visible = self._accept(tissue, plane, depth, coarse, sure)
@@ -218,7 +204,7 @@ class StereoTracker:
         self, pair: RectifiedPair, tissue: Bool[np.ndarray, "height width"], guess: Float[np.ndarray, "n 3"]
     ) -> float:
         """Share of the particles that match after one coarse step from a guess."""
-        tried = self._registration.refine(pair.left_grey, tissue, guess[:, :2], windows=(COARSE,))
+        tried = self._registration.refine(pair.left_fine, tissue, guess[:, :2], windows=(COARSE,))
         return float(np.mean(tried.match.correlation > LEAST_CORRELATION))
 
     def _moved(

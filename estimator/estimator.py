@@ -1,0 +1,233 @@
+"""The estimator's front: observations in, estimates out.
+
+While the sheet lies still before the first grasp, frames only fix where it rests. Then every frame with closed jaws goes
+perception -> grip -> filter. Sees nothing but observations, the camera's calibration and the declaration.
+"""
+
+import time
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jiggle_mj.camera import StereoCamera
+from jiggle_mj.errors import PerceptionError
+from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.filters.implicit import Evidence, ImplicitFilter, Update
+from jiggle_mj.estimator.grip import GripHold
+from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.perception import Disparity, PointTracker, StereoTracker, TissueMask, Track
+from jiggle_mj.estimator.perception.mesh_field import MeshField
+from jiggle_mj.estimator.surrogate import Membrane, surrogate
+from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, ToolState
+from jiggle_mj.sheet_triangulation import SheetPlane
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimatorConfig:
+    """Settings of the estimator; stiffnesses are shares of the declared membrane stiffness k."""
+
+    spacing: float = 4.25e-3
+    """Between the particles of a mesh laid over images [m]."""
+    membrane: Membrane = "triangles"
+    """Law of the sheet's plane: St Venant-Kirchhoff triangles, or the paper's springs along the edges."""
+    prior_sd: float = 1 / 60
+    """Standard deviation of each attachment stiffness before anything is seen [k]."""
+    force_sd: float = 3.2e-3
+    """Standard deviation of the force that the model gets wrong on a particle [k x spacing]."""
+    grip_sd: float = 1.5e-3
+    """How well held particles follow the tip [m]."""
+    grip_stiffness: float = 3.0
+    """Of the springs that carry held particles with the tip while the state is searched [k]."""
+    detect_above: float = 0.01
+    """A particle is reported attached when its mean stiffness exceeds this [k]."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("spacing", "prior_sd", "force_sd", "grip_sd", "grip_stiffness", "detect_above"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"EstimatorConfig.{name} must be above 0; got {getattr(self, name)}.")
+        if self.membrane not in ("triangles", "edges"):
+            raise ValueError(f"EstimatorConfig.membrane must be 'triangles' or 'edges'; got {self.membrane!r}.")
+
+
+class Estimator:
+    """Follows one tissue through one recording."""
+
+    def __init__(
+        self,
+        declaration: Declaration,
+        camera: StereoCamera | None = None,
+        *,
+        config: EstimatorConfig | None = None,
+        mask: TissueMask | None = None,
+        disparity: Disparity | None = None,
+    ):
+        """Say what is known beforehand.
+
+        Args:
+            declaration: what the user says of the tissue.
+            camera: needed for observations with images.
+            config: settings; the defaults are those that the README's figures were made with.
+            mask: which pixels are tissue; by colour if None.
+            disparity: dense stereo; semi-global matching if None.
+        """
+        self.declaration, self.config = declaration, config or EstimatorConfig()
+        self.skipped: list[tuple[int, str]] = []
+        """Index and reason of each observation that could not be used."""
+        self._stereo = (
+            None
+            if camera is None
+            else StereoTracker(camera, spacing=self.config.spacing, mask=mask, disparity=disparity)
+        )
+        self._points = PointTracker(declaration.mesh)
+        self._still: list[MeasuredPoints] = []
+        self._sheet: Sheet | None = None
+        self._filter: ImplicitFilter | None = None
+        self._hold: GripHold | None = None
+
+    @property
+    def sheet(self) -> Sheet:
+        """The particles; fixed from the first grasp on.
+
+        Raises:
+            ValueError: asked before that.
+        """
+        if self._sheet is None or self._filter is None:
+            raise ValueError("the sheet is not known before the first frame with closed jaws; call update first.")
+        return self._sheet
+
+    @property
+    def belief(self) -> Belief:
+        """The Gaussian belief so far."""
+        with jax.enable_x64(True):
+            mean, covariance = self._belief.moments()
+            return Belief(mean=np.asarray(mean), covariance=np.asarray(covariance))
+
+    @property
+    def detection(self) -> Detection:
+        """Which particles are called attached so far."""
+        limit = self.config.detect_above * self.declaration.membrane_stiffness
+        return Detection(
+            attached=self._b > limit, score=self._b, rule=f"non-negative mean of b > {self.config.detect_above:g} k = {limit:.3g} N/m"
+        )
+
+    def update(self, observation: Observation) -> Estimate | None:
+        """Take one observation; None when it only helps to fix the rest shape, or cannot be used.
+
+        Raises:
+            PerceptionError: the sheet cannot be found in the first frames, or a grasp is off the tissue.
+        """
+        with jax.enable_x64(True):
+            return self._update(observation)
+
+    def _update(self, observation: Observation) -> Estimate | None:
+        tool = observation.tool
+        if self._filter is None:
+            self._look_at_rest(observation)
+            if not tool.closed:
+                return None
+            self._begin()
+        if not tool.closed:
+            self._hold = None
+            return None
+        began = time.perf_counter()
+        track = self._see(observation)
+        seen = time.perf_counter()
+        if not track.visible.any():
+            self.skipped.append((observation.index, "no particle was seen"))
+            return None
+        update = self._take_in(track, tool)
+        return Estimate(
+            index=observation.index,
+            time=observation.time,
+            positions=self._x,
+            observed=track.positions,
+            mean=self._b,
+            sd=np.sqrt(np.diagonal(np.asarray(self._belief.moments()[1]))),
+            held=self._hold.held,
+            entropy=float(self._belief.entropy()),
+            nis=float(update.nis),
+            boundary_energy=0.5 * float(np.mean(self._b * np.sum((self._x - self.sheet.rest) ** 2, axis=1))),
+            update_s=time.perf_counter() - seen,
+            perception_s=seen - began,
+        )
+
+    def _look_at_rest(self, observation: Observation) -> None:
+        """Use a frame before the first grasp: the first image, every cloud of points."""
+        if observation.images is not None and self._stereo is not None:
+            if self._sheet is None:
+                self._sheet = self._stereo.start(observation.images, observation.tool)
+        elif observation.points is not None:
+            if not (observation.tool.closed and self._still):
+                self._still.append(observation.points)
+        else:
+            raise PerceptionError(
+                f"observation {observation.index} has neither points nor images with a calibrated camera; one is needed."
+            )
+
+    def _begin(self) -> None:
+        """Build the model once the rest shape is known."""
+        if self._sheet is None:
+            self._sheet = self._points.start(self._still)
+        mesh, k = SheetMesh(self._sheet.rest, self._sheet.faces), self.declaration.membrane_stiffness
+        self._filter = ImplicitFilter.build(
+            mesh,
+            surrogate(mesh, self.declaration, membrane=self.config.membrane),
+            force_sd=self.config.force_sd * k * mesh.spacing,
+            grip_stiffness=self.config.grip_stiffness * k,
+        )
+        self._field = MeshField(SheetPlane.through(mesh.rest).flatten(mesh.rest), mesh.faces)
+        self._belief = BoundaryBelief.prior(mesh.n, mean=0.0, sd=self.config.prior_sd * k)
+        self.prior_entropy = float(self._belief.entropy())
+        self._x, self._b = mesh.rest, np.zeros(mesh.n)
+
+    def _see(self, observation: Observation) -> Track:
+        if observation.images is not None and self._stereo is not None:
+            return self._stereo.track(observation.images, observation.tool, predicted=self._x)
+        if observation.points is not None:
+            return self._points.track(observation.points)
+        raise PerceptionError(f"observation {observation.index} has neither points nor images; one is needed.")
+
+    def _take_in(self, track: Track, tool: ToolState) -> Update:
+        """Fuse what was seen with what the grip says, and update state and belief."""
+        seen = track.visible
+        if self._hold is None or self._hold.grasp != tool.grasp:
+            before = self.sheet.rest
+            at_closing = np.where(seen[:, None], np.nan_to_num(track.positions), before)
+            self._hold = GripHold.close(tool, at_closing, self._named(tool))
+        else:
+            before = self._x
+        held, expected = self._hold.held, self._hold.expected(tool)
+        precision = np.where(seen[:, None, None], np.linalg.inv(track.covariance), 0.0)
+        weighed = np.einsum("nij,nj->ni", precision, np.nan_to_num(track.positions))
+        grip = np.where(held, self.config.grip_sd**-2, 0.0)
+        precision = precision + grip[:, None, None] * np.eye(3)
+        weighed = weighed + grip[:, None] * expected
+        known = seen | held
+        y = np.where(
+            known[:, None], np.linalg.solve(np.where(known[:, None, None], precision, np.eye(3)), weighed[..., None])[..., 0], 0
+        )
+        motion = np.where(known[:, None], y - before, 0.0)
+        start = before + np.where(known[:, None], motion, self._field.fill(motion, known))
+        evidence = Evidence(
+            y=jnp.asarray(np.where(known[:, None], y, start)), precision=jnp.asarray(precision), held=jnp.asarray(held)
+        )
+        update = _update(self._filter, self._belief, evidence, jnp.asarray(start))
+        self._belief, self._x, self._b = update.belief, np.asarray(update.x), np.asarray(update.b)
+        if not np.isfinite(self._x).all():
+            raise PerceptionError("the filter's state is not finite: the observation cannot be explained by any sheet.")
+        return update
+
+    def _named(self, tool: ToolState) -> Bool[np.ndarray, " n"] | None:
+        """Particles that the recording or the declaration says are held."""
+        if tool.held_tracks:
+            return np.isin(self._points.ids, tool.held_tracks)
+        return None if self.declaration.mesh is None else self.declaration.mesh.held
+
+
+_update = eqx.filter_jit(ImplicitFilter.update)

@@ -1,0 +1,48 @@
+"""Which particles the tweezer holds, and where it should have taken them.
+
+Held when the jaws close: the particles the recording names, or those within the radius of the tip. They move with the
+tip, give or take; the force on them is unknown, so the filter gives them no balance of forces.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jiggle_mj.errors import PerceptionError
+from jiggle_mj.observation import ToolState
+
+
+@dataclass(frozen=True, kw_only=True)
+class GripHold:
+    """One grasp, from closing to opening."""
+
+    grasp: int
+    held: Bool[np.ndarray, " n"]
+    closed_at: Float[np.ndarray, "n 3"]
+    """Positions of the particles when the jaws closed [m]."""
+    tip: Float[np.ndarray, " 3"]
+    """The tip when they closed [m]."""
+
+    @classmethod
+    def close(
+        cls, tool: ToolState, positions: Float[np.ndarray, "n 3"], named: Bool[np.ndarray, " n"] | None
+    ) -> "GripHold":
+        """Close the jaws over particles at the given positions; `named` overrules the radius.
+
+        Raises:
+            PerceptionError: nothing is within reach of the jaws.
+        """
+        distance = np.linalg.norm(positions - tool.position, axis=1)
+        held = distance <= tool.radius if named is None else named
+        if not held.any():
+            raise PerceptionError(
+                f"grasp {tool.grasp} is off the tissue: the tip at {np.round(tool.position, 4).tolist()} m is "
+                f"{distance.min() * 1e3:.1f} mm from the nearest particle, and the jaws reach {tool.radius * 1e3:.1f} mm "
+                "(check the tool pose, the camera pose, or the radius)."
+            )
+        return cls(grasp=tool.grasp, held=held, closed_at=positions, tip=tool.position)
+
+    def expected(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
+        """Where the held particles are if they moved with the tip [m]; meaningless for the others."""
+        return self.closed_at + (tool.position - self.tip)

@@ -1,0 +1,72 @@
+"""From measured points with identities to particles: a mesh over the first frames, then a look-up by track id.
+
+The estimator triangulates the points anew, unless a mesh is declared. Clouds without identities are refused: matching
+the nearest surface instead of the same material point loses the attachments.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from jiggle_mj.errors import PerceptionError
+from jiggle_mj.estimate import Sheet
+from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
+from jiggle_mj.observation import DeclaredMesh, MeasuredPoints
+from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
+
+LONGEST_EDGE = 2.5
+"""Triangles with a longer edge are no tissue [medians of all edges]."""
+FEWEST = 20
+"""Fewest points that make a sheet."""
+
+
+class PointTracker:
+    """Follows one sheet through a recording of points."""
+
+    def __init__(self, mesh: DeclaredMesh | None = None):
+        self._declared = mesh
+        self.ids = np.empty(0, dtype=np.int64)
+        """Track id of each particle, -1 where nothing is measured."""
+
+    def start(self, still: list[MeasuredPoints]) -> Sheet:
+        """Lay the mesh over the mean of one or more frames at rest.
+
+        Raises:
+            PerceptionError: points without identities, or too few of them.
+        """
+        found = [_by_id(points) for points in still]
+        ids = sorted(set.intersection(*(set(frame) for frame in found)))
+        if self._declared is not None:
+            self.ids = self._declared.track_id
+            rest_variance = np.full(len(self.ids), still[0].sd ** 2)
+            sheet = Sheet(rest=self._declared.vertices, faces=self._declared.faces)
+        else:
+            if len(ids) < FEWEST:
+                raise PerceptionError(f"{len(ids)} points are seen in every frame at rest; a sheet needs {FEWEST}.")
+            rest = np.mean([[frame[i] for i in ids] for frame in found], axis=0)
+            self.ids = np.asarray(ids)
+            flat = SheetPlane.through(rest).flatten(rest)
+            edges = triangulate(flat, np.inf)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+            longest = LONGEST_EDGE * np.median(np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1))
+            sheet = Sheet(rest=rest, faces=triangulate(flat, float(longest)))
+            rest_variance = np.full(len(ids), still[0].sd ** 2 / len(still))
+        self._rest_variance: Float[np.ndarray, " n"] = rest_variance
+        return sheet
+
+    def track(self, points: MeasuredPoints) -> Track:
+        """Look the particles up in one frame; the error of the rest positions is part of the covariance."""
+        found = _by_id(points)
+        unseen = np.full(3, np.nan)
+        positions = np.array([found.get(int(i), unseen) for i in self.ids])
+        visible = np.isfinite(positions).all(axis=1)
+        variance = np.where(visible, points.sd**2 + self._rest_variance, UNSEEN_VARIANCE)
+        return Track(positions=positions, covariance=variance[:, None, None] * np.eye(3), visible=visible)
+
+
+def _by_id(points: MeasuredPoints) -> dict[int, np.ndarray]:
+    """Finite points by their identity."""
+    if points.track_id is None:
+        raise PerceptionError(
+            "the points carry no track_id; the filter needs to know which point is which (track them, or record images)."
+        )
+    seen = np.isfinite(points.positions).all(axis=1) & (points.track_id >= 0)
+    return dict(zip(points.track_id[seen].tolist(), points.positions[seen], strict=True))

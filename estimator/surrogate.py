@@ -1,0 +1,40 @@
+"""The estimator's model of one sheet: its mesh and what the user declares, put together as an energy.
+
+Everything that the declaration does not say (the bed's softness, the stiffness of a grip) scales with the declared
+membrane stiffness, because positions know only ratios.
+"""
+
+from typing import Literal
+
+import numpy as np
+
+from jiggle_mj.estimator.bending import IsometricBending
+from jiggle_mj.estimator.block_tridiagonal import Layout
+from jiggle_mj.estimator.energy import SheetEnergy, Term
+from jiggle_mj.estimator.environment import Bed, Weight
+from jiggle_mj.estimator.membrane import EdgeMembrane, TriangleMembrane
+from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.observation import Declaration
+
+BED_STIFFNESS = 1 / 3
+"""Of the bed under one particle, as a share of the membrane stiffness."""
+
+Membrane = Literal["triangles", "edges"]
+
+
+def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane = "triangles") -> SheetEnergy:
+    """Membrane, bending, weight and bed of a sheet; attachments and grip are added by who uses it."""
+    k, nu = declaration.membrane_stiffness, declaration.poisson
+    plate = k * declaration.thickness**2 / (12 * (1 - nu**2))
+    elastic = (
+        TriangleMembrane.build(mesh, stiffness=k, poisson=nu)
+        if membrane == "triangles"
+        else EdgeMembrane.build(mesh, stiffness=k)
+    )
+    terms: list[Term] = [elastic, IsometricBending.build(mesh, stiffness=plate)]
+    gravity = np.asarray(declaration.gravity, dtype=float)
+    if gravity.any():
+        terms.append(Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=declaration.gravity))
+        if declaration.bed:
+            terms.append(Bed.build(mesh.rest, up=-gravity / np.linalg.norm(gravity), stiffness=BED_STIFFNESS * k))
+    return SheetEnergy.build(mesh.rest, tuple(terms), Layout.from_pattern(mesh.adjacency))
