@@ -73,7 +73,7 @@ def write_report(
     if images is not None and camera is None:
         raise ValueError("write_report got images without their camera; pass camera=StereoCamera(...).")
     carried = None if truth is None else carry(sheet, truth, estimates[-1].index)
-    kept = _steps(estimates, sheet.rest)
+    kept = shown_steps(estimates, sheet.rest)
     pairs = [] if images is None or camera is None else pictures(estimates, images, camera, kept)
     payload = _payload(sheet, estimates, detection, truth, carried)
     payload["pictures"] = [
@@ -135,7 +135,7 @@ def _payload(
         fields["truth"] = np.where(np.isfinite(carried.stiffness), carried.stiffness, top)
     for name, values in fields.items():
         grids[name] = _significant(np.sum(values[corners] * weights, axis=-1))
-    kept = _steps(estimates, sheet.rest)
+    kept = shown_steps(estimates, sheet.rest)
     return {
         "axes": list(plane.names),
         "flat": _fixed(flat, 2),
@@ -243,7 +243,8 @@ def _grasps(estimates: Sequence[Estimate]) -> list[dict[str, int]]:
     return runs
 
 
-def _steps(estimates: Sequence[Estimate], rest: np.ndarray) -> list[int]:
+def shown_steps(estimates: Sequence[Estimate], rest: np.ndarray) -> list[int]:
+    """Positions in `estimates` of the frames on the slider, thinned evenly."""
     count = min(len(estimates), MAX_STEPS, max(2, MAX_PARTICLE_STEPS // len(rest)))
     return np.unique(np.linspace(0, len(estimates) - 1, count).round().astype(int)).tolist()
 

@@ -292,6 +292,5 @@ def _packable(name: str, column: np.ndarray) -> np.ndarray:
 
 
 def _fill(message: Any, names: str, values: np.ndarray) -> None:
-    message.SetInParent()
     for name, value in zip(names, values, strict=True):
         setattr(message, name, float(value))

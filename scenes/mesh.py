@@ -1,7 +1,7 @@
 """Triangulations of the sheet, and the checks that any of them must pass.
 
-`equilateral` rows are a triangular lattice: equal triangles, offset rows, straight edges; `unstructured`
-jitters its inner vertices and triangulates them anew [Delaunay]. Regular right-triangle grids are left out on purpose:
+`equilateral` is a triangular lattice with straight edges, its rows offset by half a triangle; `unstructured` jitters
+its inner vertices and triangulates them anew (Delaunay, by scipy). Right-triangle grids are left out on purpose:
 their bending stiffness depends on the pattern.
 """
 

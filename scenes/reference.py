@@ -1,13 +1,14 @@
 """The reference tissue as an experiment: actions in, observations out, and the truth for whoever scores.
 
-Each action ends when the tissue is at rest, then one observation is taken. The observation holds nothing of MuJoCo's
-state but the tool's pose and what the chosen sensing shows.
+Each action ends when the tissue is at rest, then one observation is taken. Jaws hold every vertex within their radius
+but welded ones, which slip out: two rigid constraints would share the gap between them. The observation
+holds nothing of MuJoCo's state but the tool's pose and what the chosen sensing shows.
 """
 
 import math
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, Self, get_args
 
 import mujoco
 import numpy as np
@@ -23,7 +24,8 @@ from jiggle_mj.camera import StereoCamera
 from jiggle_mj.observation import Action, Declaration, Grasp, Move, Observation, Release, ToolState, Wait
 from jiggle_mj.truth import Truth, TruthFrame
 
-SENSING = ("stereo", "points", "particles")
+Sensing = Literal["stereo", "points", "particles"]
+SENSING: tuple[Sensing, ...] = get_args(Sensing)
 OPEN_ANGLE, CLOSED_ANGLE = 0.25, 0.0
 """Of each jaw [rad]."""
 WAIT_STEPS = 5
@@ -43,7 +45,7 @@ class Reference:
         scene: Scene,
         *,
         seed: int,
-        sensing: Literal["stereo", "points", "particles"],
+        sensing: Sensing,
         dump_dir: Path | None = None,
     ) -> None:
         if sensing not in SENSING:
@@ -163,6 +165,12 @@ class Reference:
             raise ValueError(
                 f"grasp at {_text(point)} m holds nothing: the nearest tissue is {1e3 * distance.min():.1f} mm away, "
                 f"the radius is {1e3 * action.radius:.1f} mm. Grasp closer or widen the radius."
+            )
+        inside = inside[np.isfinite(self._tissue.stiffness[inside])]
+        if not inside.size:
+            raise ValueError(
+                f"grasp at {_text(point)} m meets welded vertices only, and a weld does not yield to the jaws. "
+                "Grasp elsewhere or widen the radius."
             )
         model, data = self._tissue.model, self._data
         data.mocap_pos[0] = point

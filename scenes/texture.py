@@ -15,10 +15,12 @@ BED_RGB = np.array([62.0, 84.0, 96.0])
 def smooth_noise(
     rng: np.random.Generator, resolution: int, scales: tuple[float, ...]
 ) -> Float[np.ndarray, "resolution resolution"]:
-    """Sum of blurred white noises of unit variance each; `scales` are blur widths in texture pixels."""
+    """Sum of blurred white noises, of unit variance and without seams; `scales` are blur widths in texture pixels."""
     total = np.zeros((resolution, resolution))
     for scale in scales:
-        layer = cv2.GaussianBlur(rng.standard_normal((resolution, resolution)), (0, 0), scale)
+        margin = min(int(np.ceil(4 * scale)), resolution)
+        white = np.pad(rng.standard_normal((resolution, resolution)), margin, mode="wrap")
+        layer = cv2.GaussianBlur(white, (0, 0), scale)[margin:-margin, margin:-margin]
         total += layer / layer.std()
     return total / np.sqrt(len(scales))
 

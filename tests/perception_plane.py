@@ -42,7 +42,7 @@ def texture(seed: int) -> np.ndarray:
     """Smooth noise of several scales over the square from -2 HALF to 2 HALF, 0 to 1."""
     rng = np.random.default_rng(seed)
     layers = [cv2.GaussianBlur(rng.standard_normal((1000, 1000)), (0, 0), s) * s for s in (4.0, 8.0, 20.0)]
-    noise = sum(layers)
+    noise = np.sum(layers, axis=0)
     return (0.5 + 0.2 * noise / noise.std()).clip(0, 1).astype(np.float32)
 
 

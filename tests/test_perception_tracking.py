@@ -111,10 +111,9 @@ def test_a_sheet_that_fell_back_is_found_at_rest():
     """Lifted by 16 mm in one frame and back at rest at the next, when the jaws opened."""
     tracker, sheet = started()
     for k in range(1, 9):
-        track = tracker.track(
-            stereo(lifted(2e-3 * k), seed=k), tool(grasp=1, closed=True, z=2e-3 * k), predicted=sheet.rest
-        )
-    assert track.visible.mean() > 0.9
+        held = tool(grasp=1, closed=True, z=2e-3 * k)
+        track = tracker.track(stereo(lifted(2e-3 * k), seed=k), held, predicted=sheet.rest)
+        assert track.visible.mean() > 0.9
     fallen = tracker.track(stereo(PlaneSheet(), seed=9), tool(grasp=1), predicted=lifted(16e-3).carry(sheet.rest))
     assert fallen.visible.mean() > 0.9
     assert np.sqrt(np.nanmean(np.sum((fallen.positions - sheet.rest) ** 2, axis=1))) < 0.6e-3

@@ -53,8 +53,8 @@ def test_a_hanging_sheet_stretches_its_springs_by_its_weight():
         data, tissue = reference._data, reference._tissue
         drop = -data.qpos[tissue.qpos_address[:, 2]]
         weight = TISSUE.density * TISSUE.thickness * np.prod(TISSUE.size) * 9.81
-        # The sheet is let go from unstretched springs; 2 s later what is left of the fall is below 1e-3 of it.
-        assert k * drop.sum() == pytest.approx(weight, rel=1e-3)
+        # The sheet is let go from unstretched springs; a second later what is left of the fall is below 1e-5 of it.
+        assert k * drop.sum() == pytest.approx(weight, rel=1e-4)
 
 
 def test_the_compiled_sheet_weighs_density_times_volume():
@@ -88,13 +88,13 @@ def test_a_strip_pulled_at_both_ends_has_the_typed_modulus():
 
 
 def test_forces_balance_at_rest_while_lifted():
-    """Springs + weight + grip + bed = 0 within 2 % of the weight, since rest means 1 mm/s, not 0."""
+    """Springs + weight + grip + bed = 0 within 0.5 % of the weight, since rest means 1 mm/s, not 0; measured 0.1 %."""
     reference = particles()
     reference.step(Grasp(point=CORNER, radius=8e-3))
     reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.02])))
     reference.step(Wait())
     weight = TISSUE.density * TISSUE.thickness * np.prod(TISSUE.size) * 9.81
-    assert np.abs(net_force(reference)).max() < 0.02 * weight
+    assert np.abs(net_force(reference)).max() < 0.005 * weight
 
 
 def test_held_vertices_follow_the_tip_and_attached_ones_lag():
@@ -105,10 +105,10 @@ def test_held_vertices_follow_the_tip_and_attached_ones_lag():
     reference.step(Move(to=CORNER + lift))
     moved = reference.truth_frame().positions - before
     assert held.sum() >= 3
-    # Measured slack of the grip's constraint: below 0.3 mm; the surface normal turns by up to the flex radius, 0.2 mm.
-    assert np.linalg.norm(moved[held] - lift, axis=1).max() < 1e-3
+    # Measured 0.17 mm: 0.08 mm slack of the grip's constraint, the rest from normals that turn (radius 0.2 mm).
+    assert np.linalg.norm(moved[held] - lift, axis=1).max() < 4e-4
     attached = reference.truth().attached
-    assert np.linalg.norm(moved[attached], axis=1).max() < 0.015
+    assert np.linalg.norm(moved[attached], axis=1).max() < 0.5 * np.linalg.norm(lift)
 
 
 def test_an_attached_vertex_can_be_held_too():
@@ -131,9 +131,20 @@ def test_a_weld_stays_where_it_is_while_a_corner_is_lifted():
     reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.02])))
     attached = reference.truth().attached
     moved = np.linalg.norm(reference._data.flexvert_xpos - rest + [0, 0, TISSUE.radius], axis=1)
-    # Measured 0.2 mm where the pull is strongest: the constraint is stiff, not rigid.
+    # Measured 0.30 mm where the pull is strongest: the constraint is stiff, not rigid.
     assert moved[attached].max() < 5e-4
     assert np.isinf(reference.truth_frame().stiffness[attached]).all()
+
+
+def test_welded_vertices_slip_out_of_the_jaws_and_a_grasp_of_nothing_else_is_refused():
+    weld = dataclasses.replace(MIDDLE, stiffness=math.inf)
+    scene = dataclasses.replace(SCENE, attachments=(weld,))
+    point = np.array([0.0, 0.0, 4e-4])
+    with pytest.raises(ValueError, match="meets welded vertices only"):
+        particles(scene).step(Grasp(point=point, radius=5e-3))
+    reference = particles(scene)
+    reference.step(Grasp(point=point, radius=0.018))
+    assert reference.held.any() and not (reference.held & reference.truth().attached).any()
 
 
 def test_release_lets_the_sheet_return_and_another_corner_can_be_grasped():
@@ -142,8 +153,8 @@ def test_release_lets_the_sheet_return_and_another_corner_can_be_grasped():
     for action in programme(SCENE):
         reference.step(action)
         if isinstance(action, Release):
-            # Friction of 0.3 keeps the sheet from returning wholly; measured below 0.5 mm.
-            assert np.linalg.norm(reference.truth_frame().positions - rest, axis=1).max() < 2e-3
+            # Friction of 0.3 keeps the sheet from returning wholly; measured 0.17 mm.
+            assert np.linalg.norm(reference.truth_frame().positions - rest, axis=1).max() < 5e-4
             assert not reference.held.any()
     assert reference.truth().frames[-1].index == 2 + 4 * (1 + 2 + 1 + 1) - 1
     assert reference.capped == []

@@ -56,7 +56,7 @@ def install_packages(packages: list[str], purpose: str) -> None:
     apt = apt_command()
     if apt is None:
         sys.exit(
-            f"set-up: {purpose} needs the Debian packages {' '.join(packages)}, and this user cannot install them "
+            f"set-up: {purpose} needs the Debian package(s) {' '.join(packages)}, and this user cannot install them "
             f"here. Run 'sudo apt-get install {' '.join(packages)}' (or your system's equivalent), then try again."
         )
     say(f"{purpose}: installing {' '.join(packages)} with apt-get")

@@ -6,10 +6,10 @@ the nearest surface instead of the same material point loses the attachments.
 
 import numpy as np
 from jaxtyping import Float
+from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
-from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
 from jiggle_mj.observation import DeclaredMesh, MeasuredPoints
 from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
 

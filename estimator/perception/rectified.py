@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from jiggle_mj.estimator.perception.resampling import double
 
 from jiggle_mj.camera import CameraCalibration, StereoCamera
 from jiggle_mj.errors import PerceptionError
-from jiggle_mj.estimator.perception.resampling import double
 from jiggle_mj.observation import StereoPair
 
 DARK = 8.0

@@ -21,7 +21,7 @@ from jiggle_mj.estimator.perception.lucas_kanade import (
 )
 from jiggle_mj.estimator.perception.material_map import MaterialMap
 from jiggle_mj.estimator.perception.mesh_field import MeshField
-from jiggle_mj.estimator.perception.resampling import double, sample_doubled
+from jiggle_mj.estimator.perception.resampling import sample_doubled
 
 FINE = 4.0
 """Standard deviation of the matching window [px]."""

@@ -46,13 +46,13 @@ DISAGREEMENT = 1.5
 """Refined disparities further than this from the dense one are not believed [px]."""
 SETTLED = 0.3
 """The last step of a registration that has settled is shorter than this [px]."""
-LATERAL_SD = 0.08
-"""Error of a perfect match: where a particle lies in the first image's tissue, and resampling [px]."""
-DISPARITY_SD = 0.035
+LATERAL_SD = 0.02
+"""Error of a perfect match: where a particle lies in the first image's tissue [px]."""
+DISPARITY_SD = 0.012
 """As `LATERAL_SD`, in disparity [px]."""
-NOISE_FACTOR = 3.2
-"""Errors are this many times those of residuals independent from pixel to pixel. White noise smoothed by 0.8 px is
-alike over 4 pi 0.8^2 = 8 px, which makes 2.8; the rest is measured, with image noise of 0 to 6 grey levels."""
+NOISE_FACTOR = 3.1
+"""Errors are this many times those of residuals independent from pixel to pixel: smoothing spreads noise over
+neighbours, and robust weights make the residuals look small. Measured with image noise of 0 to 6 grey levels."""
 TREND_FACTOR = 0.6
 """Lateral error of a particle for each pixel that it is off its neighbours' trend, measured."""
 LEAST_SHARE = 0.7

@@ -1,0 +1,201 @@
+"""The two whole jobs: a scene from the tissue to the report, and a recording from its file to the report.
+
+Each fills a folder with the files of an experiment. The truth, where there is any, is opened only after the estimate is
+written.
+"""
+
+import platform
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+from jiggle_mj.episode import (
+    ESTIMATE,
+    RECORDING,
+    REPORT,
+    RESULT,
+    Episode,
+    OnFrame,
+    Stopwatch,
+    estimate,
+    observe,
+    prepare_directory,
+)
+from jiggle_mj.errors import OutputError
+from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
+from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.eval.report import shown_steps, write_report
+from jiggle_mj.eval.score import Json, result, score, write_result
+from jiggle_mj.importing import truth_path
+from jiggle_mj.observation import StereoPair
+from jiggle_mj.recording import Recording
+from jiggle_mj.scenes import Reference, Scene, programme
+from jiggle_mj.scenes.reference import Sensing
+from jiggle_mj.truth import Truth
+from jiggle_mj.truth_recording import read_truth
+
+PACKAGES = ("jiggle-mj", "mujoco", "jax", "numpy", "scipy", "opencv-python-headless")
+
+
+def run_scene(
+    scene: Scene,
+    directory: Path,
+    *,
+    seed: int = 0,
+    sensing: Sensing = "stereo",
+    config: EstimatorConfig | None = None,
+    overwrite: bool = False,
+    on_frame: OnFrame | None = None,
+) -> Json:
+    """The main job: reference tissue, observations, estimate, score, report.
+
+    Args:
+        scene: the tissue and the grasp programme.
+        directory: where the files go.
+        seed: of noise and texture; the same seed gives the same recording.
+        sensing: what the estimator sees.
+        config: of the estimator.
+        overwrite: replace an earlier run's files.
+        on_frame: called after each frame.
+
+    Returns:
+        The content of result.json.
+
+    Raises:
+        JiggleError: what any of the parts raises.
+    """
+    prepare_directory(directory, overwrite=overwrite)
+    watch = Stopwatch()
+    with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference:
+        estimator = Estimator(reference.declaration, reference.camera, config=config)
+        frames = observe(reference, programme(scene), directory / RECORDING, seed=seed, watch=watch)
+        episode = estimate(frames, estimator, directory / ESTIMATE, metadata=_name(scene.name), on_frame=on_frame)
+    unscored = _result(
+        episode, scene=scene.name, seed=seed, sensing=sensing, policy="corners", simulation_s=watch.seconds
+    )
+    write_result(directory / RESULT, unscored)
+    scored = score(directory, truth_path(directory / RECORDING))
+    truth = read_truth(truth_path(directory / RECORDING))
+    _report(directory, episode, scored, recording=directory / RECORDING, truth=truth)
+    return scored
+
+
+def run_estimator(
+    recording_path: Path,
+    directory: Path,
+    *,
+    config: EstimatorConfig | None = None,
+    overwrite: bool = False,
+    allow_truncated: bool = False,
+    on_frame: OnFrame | None = None,
+) -> Json:
+    """Estimate from a recording: observations only.
+
+    Args:
+        recording_path: the MCAP file.
+        directory: where the files go.
+        config: of the estimator.
+        overwrite: replace an earlier run's files.
+        allow_truncated: use what is whole of a recording that was cut off.
+        on_frame: called after each frame.
+
+    Returns:
+        The content of result.json, without what needs the truth.
+
+    Raises:
+        JiggleError: what any of the parts raises.
+    """
+    recording = Recording.open(recording_path, allow_truncated=allow_truncated)
+    prepare_directory(directory, overwrite=overwrite)
+    estimator = Estimator(recording.declaration, recording.camera, config=config)
+    name = recording.metadata.get("name", recording_path.stem)
+    episode = estimate(recording, estimator, directory / ESTIMATE, metadata=_name(name), on_frame=on_frame)
+    figures = _result(
+        episode,
+        scene=name,
+        seed=int(recording.metadata.get("seed", 0)),
+        sensing=recording.metadata.get("sensing", "points" if recording.camera is None else "stereo"),
+        policy="recorded",
+        skipped=tuple(recording.skipped),
+    )
+    write_result(directory / RESULT, figures)
+    _report(directory, episode, figures, recording=recording_path)
+    return figures
+
+
+def score_directory(directory: Path, truth: Path) -> Json:
+    """Score an estimate that lies in a folder, and write its report anew with the truth beside it.
+
+    Raises:
+        RecordingError: the folder holds no estimate, or the file no truth.
+        OutputError: the estimate did not finish.
+    """
+    figures = score(directory, truth)
+    read = read_estimate(directory / ESTIMATE)
+    recording = directory / RECORDING
+    _report(directory, read, figures, recording=recording if recording.exists() else None, truth=read_truth(truth))
+    return figures
+
+
+def _report(
+    directory: Path,
+    found: Episode | EstimateRecording,
+    figures: Json,
+    *,
+    recording: Path | None,
+    truth: Truth | None = None,
+) -> None:
+    """Write report.html; the pictures come from the recording, if there is one with images."""
+    if found.belief is None or found.detection is None:
+        raise OutputError(f"{directory / ESTIMATE} ends before its belief; estimate the recording again.")
+    opened = None if recording is None else Recording.open(recording, allow_truncated=True)
+    settings: dict[str, object] = {"estimate": dict(read_estimate(directory / ESTIMATE).metadata)}
+    if opened is not None:
+        declared = asdict(opened.declaration)
+        settings["declared"] = {key: value for key, value in declared.items() if key != "mesh"}
+    settings["versions"] = {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+    pairs: dict[int, StereoPair] = {}
+    if opened is not None and opened.camera is not None:
+        shown = {found.estimates[step].index for step in shown_steps(found.estimates, found.sheet.rest)}
+        pairs = {frame.index: frame.images for frame in opened if frame.index in shown and frame.images is not None}
+    write_report(
+        directory / REPORT,
+        sheet=found.sheet,
+        estimates=found.estimates,
+        belief=found.belief,
+        detection=found.detection,
+        result=figures,
+        settings=settings,
+        truth=truth,
+        images=pairs.get if pairs else None,
+        camera=None if opened is None else opened.camera,
+    )
+
+
+def _name(name: str) -> dict[str, str]:
+    return {"recording": name}
+
+
+def _result(
+    episode: Episode,
+    *,
+    scene: str,
+    seed: int,
+    sensing: str,
+    policy: str,
+    skipped: tuple[tuple[int, str], ...] = (),
+    simulation_s: float | None = None,
+) -> Json:
+    return result(
+        scene=scene,
+        seed=seed,
+        sensing=sensing,
+        estimator="implicit",
+        policy=policy,
+        sheet=episode.sheet,
+        estimates=episode.estimates,
+        detection=episode.detection,
+        prior_entropy=episode.prior_entropy,
+        skipped=sorted((*skipped, *episode.skipped)),
+        simulation_s=simulation_s,
+    )

@@ -1,0 +1,233 @@
+"""The command line: `jiggle-mj VERB`. Results go to files and, with --json, to stdout; everything else to stderr.
+
+Exit codes: 0 fine, 1 the run failed, 2 bad usage (a scene, an option or an output folder that cannot be used). Heavy
+imports happen inside the verbs, so that help is quick.
+"""
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from jiggle_mj.errors import JiggleError, OutputError, SceneError
+
+if TYPE_CHECKING:
+    from jiggle_mj.episode import OnFrame
+    from jiggle_mj.estimate import Estimate
+    from jiggle_mj.observation import Observation
+
+Sensing = Literal["stereo", "points", "particles"]
+PathArgument = Annotated[Path, tyro.conf.Positional]
+Name = Annotated[str, tyro.conf.Positional]
+Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+AsJson = Annotated[bool, tyro.conf.arg(name="json")]
+
+console = Console(stderr=True)
+
+
+def run(
+    scene: Name,
+    /,
+    *,
+    out: Out,
+    sensing: Sensing = "stereo",
+    seed: int = 0,
+    overwrite: bool = False,
+    as_json: AsJson = False,
+) -> None:
+    """The main job: reference tissue, stereo, estimate, score, report.
+
+    Args:
+        scene: a shipped scene (arc, line, ...) or the path of a scene file.
+        out: folder for run.mcap, run.truth.mcap, estimate.mcap, result.json and report.html.
+        sensing: what the estimator sees: images; noisy tracked points of the tissue; noisy vertices of the reference.
+        seed: of noise and texture.
+        overwrite: replace results that are already in the folder.
+        as_json: print result.json to stdout.
+    """
+    from jiggle_mj.eval.experiment import run_scene
+    from jiggle_mj.scenes import load_scene, programme
+
+    loaded = load_scene(scene)
+    with _progress(sum(1 for _ in programme(loaded)), f"run {loaded.name}") as on_frame:
+        figures = run_scene(loaded, out, seed=seed, sensing=sensing, overwrite=overwrite, on_frame=on_frame)
+    _show(figures, out, as_json)
+
+
+def record(
+    scene: Name, /, *, out: Out, sensing: Sensing = "stereo", seed: int = 0, overwrite: bool = False
+) -> None:
+    """The reference tissue alone: observations to OUT, the truth to a file of its own beside it.
+
+    Args:
+        scene: a shipped scene or the path of a scene file.
+        out: the recording, for example run.mcap; the truth goes to run.truth.mcap.
+        sensing: what is recorded.
+        seed: of noise and texture.
+        overwrite: replace files that are already there.
+    """
+    from jiggle_mj.episode import observe
+    from jiggle_mj.scenes import Reference, load_scene, programme
+
+    loaded = load_scene(scene)
+    with (
+        _progress(sum(1 for _ in programme(loaded)), f"record {loaded.name}") as on_frame,
+        Reference(loaded, seed=seed, sensing=sensing, dump_dir=out.parent) as reference,
+    ):
+        for observation in observe(reference, programme(loaded), out, seed=seed, overwrite=overwrite):
+            on_frame(observation, None)
+    console.print(f"wrote {out}")
+
+
+def import_(
+    folder: PathArgument, /, *, out: Out, recording: Path | None = None, overwrite: bool = False, as_json: AsJson = False
+) -> None:
+    """A folder of measured data into a recording.
+
+    Args:
+        folder: where the data files are.
+        out: the recording to write; what the toml holds as truth goes to a file of its own beside it.
+        recording: the recording.toml that describes the data; the folder's own if left out.
+        overwrite: replace files that are already there.
+        as_json: print a summary to stdout.
+    """
+    from jiggle_mj.importing import import_folder
+
+    summary = import_folder(folder, recording, out, overwrite=overwrite)
+    for name, why in summary.skipped:
+        console.print(f"left out {name}: {why}")
+    console.print(
+        f"wrote {summary.recording}: {summary.n_frames} frames of {summary.n_points} points, {summary.n_unseen} times "
+        f"a point was not seen, {summary.n_held} held; truth: {summary.truth or 'none'}"
+    )
+    if as_json:
+        print(json.dumps(asdict(summary), default=str))
+
+
+def estimate(
+    recording: PathArgument,
+    /,
+    *,
+    out: Out,
+    allow_truncated: bool = False,
+    overwrite: bool = False,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate from a recording, which holds observations only.
+
+    Args:
+        recording: an MCAP file.
+        out: folder for estimate.mcap, result.json and report.html.
+        allow_truncated: use what is whole of a recording that was cut off.
+        overwrite: replace results that are already in the folder.
+        as_json: print result.json to stdout.
+    """
+    from jiggle_mj.eval.experiment import run_estimator
+    from jiggle_mj.recording import Recording
+
+    length = len(Recording.open(recording, allow_truncated=allow_truncated))
+    with _progress(length, f"estimate {recording.name}") as on_frame:
+        figures = run_estimator(
+            recording, out, overwrite=overwrite, allow_truncated=allow_truncated, on_frame=on_frame
+        )
+    _show(figures, out, as_json)
+
+
+def score(directory: PathArgument, /, *, truth: Path, as_json: AsJson = False) -> None:
+    """Score an estimate against a truth file, and write the truth into its report.
+
+    Args:
+        directory: a folder that `run` or `estimate` filled.
+        truth: the truth file, for example run.truth.mcap.
+        as_json: print result.json to stdout.
+    """
+    from jiggle_mj.eval.experiment import score_directory
+
+    _show(score_directory(directory, truth), directory, as_json)
+
+
+def doctor(*, as_json: AsJson = False) -> None:
+    """Check this machine: versions, JAX devices, offscreen OpenGL, cores and memory.
+
+    Args:
+        as_json: print the checks to stdout.
+    """
+    from jiggle_mj.doctor import doctor as examine
+
+    checks = examine()
+    table = Table("", "check", "found", "what to do", box=None)
+    for check in checks:
+        table.add_row("[green]ok[/]" if check.ok else "[red]no[/]", check.name, check.detail, check.remedy or "")
+    console.print(table)
+    if as_json:
+        print(json.dumps([asdict(check) for check in checks]))
+    if not all(check.ok for check in checks):
+        sys.exit(1)
+
+
+VERBS = {"run": run, "record": record, "import": import_, "estimate": estimate, "score": score, "doctor": doctor}
+
+
+def main() -> None:
+    """Entry point of `jiggle-mj`."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            VERBS,
+            prog="jiggle-mj",
+            description="Find where a tissue is attached, how strongly and how surely, from pulls seen by a camera.",
+        )
+    except (SceneError, OutputError, ValueError) as failure:
+        _stop(failure, 2)
+    except JiggleError as failure:
+        _stop(failure, 1)
+    except KeyboardInterrupt:
+        _stop("interrupted; what was recorded so far is in the output", 130)
+
+
+def _stop(failure: object, code: int) -> None:
+    console.print(f"jiggle-mj: {failure}", style="red", markup=False, highlight=False, soft_wrap=True)
+    sys.exit(code)
+
+
+@contextmanager
+def _progress(total: int, title: str) -> "Iterator[OnFrame]":
+    """A bar on stderr."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(title, total=total)
+
+        def on_frame(observation: "Observation", found: "Estimate | None") -> None:
+            note = "" if found is None else f", entropy {found.entropy:.0f} nat"
+            bar.update(task, advance=1, description=f"{title}: grasp {observation.tool.grasp}{note}")
+
+        yield on_frame
+
+
+def _show(figures: dict, out: Path, as_json: bool) -> None:
+    """What was found, in a few lines; the whole of it with --json."""
+    detection, calibration = figures["detection"], figures["calibration"]
+    console.print(f"{detection['n_detected']} of {figures['n_particles']} particles reported attached ({detection['rule']})")
+    if detection["n_attached"] is not None:
+        table = Table("rings", "PCD %", "PUG %", "F1 %", box=None)
+        for rings, one in detection["by_dilation"].items():
+            table.add_row(rings, *("-" if one[name] is None else f"{100 * one[name]:.1f}" for name in ("pcd", "pug", "f1")))
+        console.print(table)
+        parts = [f"{detection['n_attached']} truly attached"]
+        if calibration["nees_per_dof"] is not None:
+            parts.append(f"NEES per dof {calibration['nees_per_dof']:.2f}")
+        if figures["tracking"]["rms_m"] is not None:
+            parts.append(f"tracking RMS {1e3 * figures['tracking']['rms_m']:.2f} mm")
+        console.print(", ".join(parts))
+    for skipped in figures["frames"]["skipped"]:
+        console.print(f"frame {skipped['index']} skipped: {skipped['why']}")
+    console.print(f"report: {out / 'report.html'}")
+    if as_json:
+        print(json.dumps(figures))

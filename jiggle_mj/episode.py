@@ -1,0 +1,175 @@
+"""The loop: actions move the reference tissue, observations move the estimate, and both are written as they come.
+
+Three streams that compose: `observe` turns actions into observations (and records them), `estimate` turns observations
+into an estimate (and records it); a recording is another source of observations. Nothing is scored here.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from jiggle_mj.errors import OutputError, PerceptionError
+from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.estimate_recording import EstimateWriter
+from jiggle_mj.estimator import Estimator
+from jiggle_mj.importing import truth_path
+from jiggle_mj.observation import Action, Observation
+from jiggle_mj.recording import RecordingWriter
+from jiggle_mj.scenes import Reference
+from jiggle_mj.truth_recording import TruthWriter
+
+RECORDING, ESTIMATE, RESULT, REPORT = "run.mcap", "estimate.mcap", "result.json", "report.html"
+
+OnFrame = Callable[[Observation, Estimate | None], None]
+"""Called after each frame, for progress; the estimate is None where there is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """What the estimator made of a series of observations."""
+
+    sheet: Sheet
+    estimates: tuple[Estimate, ...]
+    belief: Belief
+    detection: Detection
+    prior_entropy: float
+    """Of the belief before anything was seen [nat]."""
+    skipped: tuple[tuple[int, str], ...]
+    """Index and reason of each observation that the estimator could not use."""
+
+
+class Stopwatch:
+    """Adds up the time spent in one part of a loop."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def __enter__(self) -> None:
+        self._began = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds += time.perf_counter() - self._began
+
+
+def prepare_directory(directory: Path, *, overwrite: bool) -> None:
+    """Make an output folder, and clear it of an earlier run's files if that is allowed.
+
+    Raises:
+        OutputError: it holds results, or is a file.
+    """
+    if directory.exists() and not directory.is_dir():
+        raise OutputError(f"{directory} is a file; give a folder for the results.")
+    names = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
+    there = [name for name in names if (directory / name).exists()]
+    if there and not overwrite:
+        raise OutputError(f"{directory} already holds {', '.join(there)}; choose another folder or pass --overwrite.")
+    directory.mkdir(parents=True, exist_ok=True)
+    for name in there:
+        (directory / name).unlink()
+
+
+def observe(
+    reference: Reference,
+    actions: Iterable[Action],
+    path: Path | None = None,
+    *,
+    seed: int,
+    overwrite: bool = False,
+    watch: Stopwatch | None = None,
+) -> Iterator[Observation]:
+    """Carry out actions on the reference tissue, one observation each.
+
+    Args:
+        reference: the tissue.
+        actions: what to do; may be a policy that looks at the estimate before it yields the next.
+        path: where to record, truth in a file of its own beside it; None for nowhere.
+        seed: of the run, for the recording's metadata.
+        overwrite: replace files that are there.
+        watch: adds up the time of the simulation.
+    """
+    watch = watch or Stopwatch()
+    with ExitStack() as files:
+        recording = truth_file = None
+        if path is not None:
+            start = reference.truth()
+            recording = files.enter_context(
+                RecordingWriter(
+                    path,
+                    camera=reference.camera,
+                    declaration=reference.declaration,
+                    metadata={"name": start.scene, "seed": str(seed), "sensing": reference.sensing},
+                    overwrite=overwrite,
+                )
+            )
+            truth_file = files.enter_context(
+                TruthWriter(
+                    truth_path(path),
+                    rest=start.rest,
+                    faces=start.faces,
+                    attached=start.attached,
+                    scene=start.scene,
+                    details=start.details,
+                    overwrite=overwrite,
+                )
+            )
+        for action in actions:
+            with watch:
+                observation = reference.step(action)
+            if recording is not None and truth_file is not None:
+                recording.write(observation)
+                truth_file.write(reference.truth_frame())
+            yield observation
+
+
+def estimate(
+    observations: Iterable[Observation],
+    estimator: Estimator,
+    path: Path | None = None,
+    *,
+    metadata: dict[str, str] | None = None,
+    on_frame: OnFrame | None = None,
+) -> Episode:
+    """Show observations to an estimator, one after the other.
+
+    Args:
+        observations: from `observe` or a recording.
+        estimator: a fresh one.
+        path: where to write the estimate; None for nowhere.
+        metadata: of that file.
+        on_frame: called after each frame.
+
+    Raises:
+        PerceptionError: nothing was estimated at all, or what `Estimator.update` raises.
+    """
+    estimates: list[Estimate] = []
+    settings = {name: str(value) for name, value in asdict(estimator.config).items()}
+    with ExitStack() as files:
+        writer: EstimateWriter | None = None
+        for observation in observations:
+            one = estimator.update(observation)
+            if one is not None:
+                if writer is None and path is not None:
+                    writer = files.enter_context(EstimateWriter(path, estimator.sheet, settings | (metadata or {})))
+                if writer is not None:
+                    writer.write(one, n_skipped=len(estimator.skipped))
+                estimates.append(one)
+            if on_frame is not None:
+                on_frame(observation, one)
+        if not estimates:
+            why = "; ".join(f"frame {index}: {reason}" for index, reason in estimator.skipped[:3])
+            raise PerceptionError(
+                f"no frame could be used ({why or 'none has closed jaws'}); the estimator learns from frames in which the "
+                "tool holds the tissue."
+            )
+        if writer is not None:
+            writer.finish(estimator.belief, estimator.detection, skipped=estimator.skipped)
+    return Episode(
+        sheet=estimator.sheet,
+        estimates=tuple(estimates),
+        belief=estimator.belief,
+        detection=estimator.detection,
+        prior_entropy=estimator.prior_entropy,
+        skipped=tuple(estimator.skipped),
+    )
