@@ -65,7 +65,10 @@ def test_the_compiled_sheet_weighs_density_times_volume():
 
 
 def test_a_strip_pulled_at_both_ends_has_the_typed_modulus():
-    """Uniaxial stretch by 1 %: F / (width * strain) = E * t. The ends cannot narrow, so the middle decides: 10 %."""
+    """F / (width e) = E t (1 + e) (1 + e / 2), St Venant-Kirchhoff in uniaxial stress, e the strain of the middle.
+
+    Measured 30.61 N/m against 30.60 at e = 1.3 %; 2 % is left for the ends, which cannot narrow.
+    """
     length, width = 0.12, 0.03
     tissue = Tissue(size=(length, width), spacing=6e-3)
     ends = tuple(Disc(centre=(x, 0.0), radius=0.02, stiffness=math.inf) for x in (-length / 2, length / 2))
@@ -84,7 +87,8 @@ def test_a_strip_pulled_at_both_ends_has_the_typed_modulus():
     strain = np.polyfit(rest[inner, 0], moved[inner], 1)[0]
     force = abs(data.qfrc_constraint[dofs[left, 0]].sum())
     assert strain > 0.01
-    assert force / (width * strain) == pytest.approx(tissue.young * tissue.thickness, rel=0.1)
+    expected = tissue.young * tissue.thickness * (1 + strain) * (1 + strain / 2)
+    assert force / (width * strain) == pytest.approx(expected, rel=0.02)
 
 
 def test_forces_balance_at_rest_while_lifted():

@@ -82,7 +82,7 @@ def make_environment(venv: Path) -> Path:
 def install_project(python: Path) -> None:
     """Install the locked dependencies, each checked against its hash, and the project itself, editable."""
     pip = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
-    say("installing the locked packages (about 350 MB to download the first time)")
+    say("installing the locked packages (about 330 MB to download the first time)")
     run(*pip, "--require-hashes", "--only-binary", ":all:", "--requirement", ROOT / "requirements-dev.lock")
     run(*pip, "--no-deps", "--no-build-isolation", "--editable", ROOT)
 

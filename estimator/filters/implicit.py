@@ -73,11 +73,11 @@ class ImplicitFilter(eqx.Module):
     grip_stiffness: Float[Array, ""]
     """Stiffness of the tethers of held particles [N/m]."""
     state_steps: int = eqx.field(static=True)
-    joint_steps: int = eqx.field(static=True)
+    """Gauss-Newton steps on the state alone, before the one on state and belief."""
 
     @classmethod
     def build(
-        cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, grip_stiffness: float, state_steps: int = 20, joint_steps: int = 2
+        cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, grip_stiffness: float, state_steps: int = 1
     ) -> "ImplicitFilter":
         """Prepare the index tables for a mesh and its energy; force_sd [N], grip_stiffness [N/m]."""
         near = mesh.adjacency.tocsr()
@@ -104,26 +104,22 @@ class ImplicitFilter(eqx.Module):
             force_sd=jnp.asarray(force_sd, dtype=float),
             grip_stiffness=jnp.asarray(grip_stiffness, dtype=float),
             state_steps=state_steps,
-            joint_steps=joint_steps,
         )
 
     def update(self, belief: BoundaryBelief, evidence: Evidence, start: Float[Array, "n 3"]) -> Update:
         """Take one frame into the belief, searching the state from `start` [m]."""
         b = belief.non_negative_mean()
         x = self._settle(start, b, evidence)
-        updated = belief
-        for _ in range(self.joint_steps):
-            frame = self._linearise(x, b, evidence)
-            gained, shift = self._information(frame, b)
-            updated = belief.add(gained, shift)
-            new_b = updated.non_negative_mean()
-            x = x + self._state_step(frame, evidence, new_b - b)
-            b = new_b
-        weight = self._force_weight(evidence)
-        squares = 2 * self._cost(x, b, evidence)
+        for _ in range(self.state_steps):
+            x = x + self._state_step(self._linearise(x, b, evidence), evidence, jnp.zeros_like(b))
+        frame = self._linearise(x, b, evidence)
+        gained, shift = self._information(frame, b)
+        belief = belief.add(gained, shift)
+        b, before = belief.non_negative_mean(), b
+        x = x + self._state_step(frame, evidence, b - before)
         observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
-        degrees = observed + 3 * jnp.sum(weight > 0) - 3 * len(x)
-        return Update(belief=updated, x=x, b=b, nis=squares / jnp.maximum(degrees, 1))
+        degrees = observed - 3 * jnp.sum(evidence.held)
+        return Update(belief=belief, x=x, b=b, nis=2 * self._cost(x, b, evidence) / jnp.maximum(degrees, 1))
 
     def _force_weight(self, evidence: Evidence) -> Float[Array, " n"]:
         return jnp.where(evidence.held, 0.0, self.force_sd**-2)
@@ -145,7 +141,7 @@ class ImplicitFilter(eqx.Module):
         stiff = self.grip_stiffness * jnp.eye(3, dtype=x.dtype)
         pull = jnp.where(evidence.held[:, None, None], stiff, pull)
         tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
-        return equilibrium(tethered, b, x, force_tolerance=self.force_sd / 40, max_steps=self.state_steps).x
+        return equilibrium(tethered, b, x, force_tolerance=self.force_sd / 40, max_steps=25).x
 
     def _linearise(
         self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence

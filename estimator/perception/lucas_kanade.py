@@ -1,10 +1,9 @@
 """Windowed Lucas-Kanade registration at the particles, on whole images at once.
 
 Two images that were warped into the same material coordinates are compared in Gaussian windows around each particle:
-both are normalised locally, residuals are weighted down robustly, and one Gauss-Newton step of the mean gradient of
-the two images is solved per particle (Baker & Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd; the mean of both
-gradients after Benhimane & Malis 2004, doi:10.1109/IROS.2004.1389474). Every windowed sum is one Gaussian filter over
-the image. Does not search: the start must be within about one window width.
+both are normalised locally, residuals are weighted down robustly, and one Gauss-Newton step (Baker & Matthews 2004,
+doi:10.1023/B:VISI.0000011205.11775.fd) is solved per particle, with the mean gradient of the two images. Every
+windowed sum is one Gaussian filter over the image. Does not search: the start must be within about one window width.
 """
 
 from dataclasses import dataclass
