@@ -1,8 +1,8 @@
 """Bending of the sheet: the quadratic isometric model over hinges [Bergou et al. 2006, doi:10.2312/SGP/SGP06/227-230].
 
-Linear in the positions, so its Hessian is constant and positive semi-definite. The rest shape is flat. It resists the
-mean curvature only. A hinge of area A weighs B / A, a third of the paper's 3 / A: with that a sheet bent to a cylinder
-of curvature c stores B c^2 / 2 per area, as a plate does (a test measures it).
+Resists a change of the mean curvature only. A hinge of area A weighs B / A, a third of the paper's 3 / A: with that a
+sheet bent to a cylinder of curvature c stores B c^2 / 2 per area, as a plate does (a test measures it). The curvature at
+rest turns with the hinge's normal, so that a sheet measured with some roughness is at rest where it was measured.
 """
 
 import jax.numpy as jnp
@@ -14,38 +14,43 @@ from jiggle_mj.estimator.mesh import SheetMesh
 
 
 class IsometricBending(Term):
-    """One hinge an inner edge: 1/2 |sum_a w_a x_a|^2."""
+    """One hinge an inner edge: 1/2 |sum_a w_a x_a - c n|^2 with n the hinge's unit normal."""
 
     vertices: Int[np.ndarray, "h 4"] | Int[Array, "h 4"]
     weight: Float[Array, "h 4"]
     """Cotangent weights times the square root of the hinge's stiffness [(N/m)^(1/2)]."""
+    curvature: Float[Array, " h"]
+    """c, the weighted sum along the normal at rest [J^(1/2)]."""
 
     @classmethod
     def build(cls, mesh: SheetMesh, *, stiffness: float) -> "IsometricBending":
         """Hinges of the mesh; stiffness is the plate's B = E t^3 / (12 (1 - nu^2)) [N m]."""
-        x0, x1, x2, x3 = np.moveaxis(mesh.rest[mesh.hinges], 1, 0)
+        rest = mesh.rest[mesh.hinges]
+        x0, x1, x2, x3 = np.moveaxis(rest, 1, 0)
         c01, c02 = _cotangent(x1 - x0, x2 - x0), _cotangent(x1 - x0, x3 - x0)
         c03, c04 = _cotangent(x0 - x1, x2 - x1), _cotangent(x0 - x1, x3 - x1)
         cotangent = np.stack([c03 + c04, c01 + c02, -c01 - c03, -c02 - c04], axis=1)
-        area = 0.5 * (np.linalg.norm(np.cross(x1 - x0, x2 - x0), axis=1) + np.linalg.norm(np.cross(x1 - x0, x3 - x0), axis=1))
-        return cls(vertices=mesh.hinges, weight=jnp.asarray(cotangent * np.sqrt(stiffness / area)[:, None]))
+        first, second = np.cross(x1 - x0, x2 - x0), np.cross(x1 - x0, x3 - x0)
+        area = 0.5 * (np.linalg.norm(first, axis=1) + np.linalg.norm(second, axis=1))
+        weight = cotangent * np.sqrt(stiffness / area)[:, None]
+        curvature = np.sum(np.einsum("ha,hai->hi", weight, rest) * np.asarray(_normal(rest)), axis=1)
+        return cls(vertices=mesh.hinges, weight=jnp.asarray(weight), curvature=jnp.asarray(curvature))
 
     def energy(self, x: Float[Array, "h 4 3"]) -> Float[Array, " h"]:
-        """Squared weighted sum of the four positions [J]."""
-        return 0.5 * jnp.sum(jnp.einsum("ha,hai->hi", self.weight, x) ** 2, axis=1)
-
-    def gradient(self, x: Float[Array, "h 4 3"]) -> Float[Array, "h 4 3"]:
-        """[N]."""
-        return jnp.einsum("ha,hb,hbi->hai", self.weight, self.weight, x)
-
-    def hessian(self, x: Float[Array, "h 4 3"]) -> Float[Array, "h 4 3 4 3"]:
-        """[N/m]."""
-        return jnp.einsum("ha,hb,ij->haibj", self.weight, self.weight, jnp.eye(3, dtype=x.dtype))
+        """[J]."""
+        bent = jnp.einsum("ha,hai->hi", self.weight, x) - self.curvature[:, None] * _normal(x)
+        return 0.5 * jnp.sum(bent**2, axis=1)
 
     def positive_hessian(self, x: Float[Array, "h 4 3"]) -> Float[Array, "h 4 3 4 3"]:
-        """The Hessian, which is semi-definite already."""
-        return self.hessian(x)
+        """The Hessian for a flat rest shape, which is semi-definite [N/m]."""
+        return jnp.einsum("ha,hb,ij->haibj", self.weight, self.weight, jnp.eye(3, dtype=x.dtype))
 
+
+def _normal(x: Float[Array, "h 4 3"]) -> Float[Array, "h 3"]:
+    """Unit mean normal of a hinge's two triangles."""
+    edge = x[:, 1] - x[:, 0]
+    normal = jnp.cross(edge, x[:, 2] - x[:, 0]) - jnp.cross(edge, x[:, 3] - x[:, 0])
+    return normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
 
 
 def _cotangent(u: Float[np.ndarray, "h 3"], v: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, " h"]:

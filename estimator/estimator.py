@@ -37,7 +37,7 @@ class EstimatorConfig:
     """Law of the sheet's plane: St Venant-Kirchhoff triangles, or the paper's springs along the edges."""
     prior_sd: float = 1 / 60
     """Standard deviation of each attachment stiffness before anything is seen [k]."""
-    force_sd: float = 3.2e-3
+    force_sd: float = 4.5e-3
     """Standard deviation of the force that the model gets wrong on a particle [k x spacing]."""
     grip_sd: float = 1.5e-3
     """How well held particles follow the tip [m]."""
@@ -217,7 +217,7 @@ class Estimator:
         evidence = Evidence(
             y=jnp.asarray(np.where(known[:, None], y, start)), precision=jnp.asarray(precision), held=jnp.asarray(held)
         )
-        update = _update(self._filter, self._belief, evidence, jnp.asarray(start))
+        update = _update(self._filter, self._belief, jnp.asarray(self._b), evidence, jnp.asarray(start))
         self._belief, self._x, self._b = update.belief, np.asarray(update.x), np.asarray(update.b)
         if not np.isfinite(self._x).all():
             raise PerceptionError("the filter's state is not finite: the observation cannot be explained by any sheet.")

@@ -1,4 +1,4 @@
-"""Settings that every test shares: offscreen OpenGL, JAX on the CPU in float64, shapes and types checked at each call.
+"""Settings that every test shares: offscreen OpenGL, JAX on the CPU in float64, strict promotion, checked signatures.
 
 The environment is set before mujoco or jax is imported, which is when they read it.
 """
@@ -25,6 +25,7 @@ CHECKER = (
 jaxtyping.install_import_hook("jiggle_mj", CHECKER)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
 @pytest.fixture

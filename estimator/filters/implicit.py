@@ -73,11 +73,11 @@ class ImplicitFilter(eqx.Module):
     grip_stiffness: Float[Array, ""]
     """Stiffness of the tethers of held particles [N/m]."""
     state_steps: int = eqx.field(static=True)
-    """Gauss-Newton steps on the state alone, before the one on state and belief."""
+    """Most Gauss-Newton steps on the state alone, before the one on state and belief."""
 
     @classmethod
     def build(
-        cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, grip_stiffness: float, state_steps: int = 1
+        cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, grip_stiffness: float, state_steps: int = 8
     ) -> "ImplicitFilter":
         """Prepare the index tables for a mesh and its energy; force_sd [N], grip_stiffness [N/m]."""
         near = mesh.adjacency.tocsr()
@@ -106,12 +106,19 @@ class ImplicitFilter(eqx.Module):
             state_steps=state_steps,
         )
 
-    def update(self, belief: BoundaryBelief, evidence: Evidence, start: Float[Array, "n 3"]) -> Update:
-        """Take one frame into the belief, searching the state from `start` [m]."""
-        b = belief.non_negative_mean()
+    def update(
+        self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
+    ) -> Update:
+        """Take one frame into the belief.
+
+        Args:
+            belief: before the frame.
+            b: its non-negative mean [N/m].
+            evidence: what was seen.
+            start: where the search for the state begins [m].
+        """
         x = self._settle(start, b, evidence)
-        for _ in range(self.state_steps):
-            x = x + self._state_step(self._linearise(x, b, evidence), evidence, jnp.zeros_like(b))
+        x = self._refine(x, b, evidence)
         frame = self._linearise(x, b, evidence)
         gained, shift = self._information(frame, b)
         belief = belief.add(gained, shift)
@@ -142,6 +149,26 @@ class ImplicitFilter(eqx.Module):
         pull = jnp.where(evidence.held[:, None, None], stiff, pull)
         tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
         return equilibrium(tethered, b, x, force_tolerance=self.force_sd / 40, max_steps=25).x
+
+    def _refine(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
+        """State-only Gauss-Newton steps at fixed b, until one gains less than `SETTLED` of the cost."""
+
+        def step(state):  # noqa: ANN001, ANN202
+            x, cost, _, count = state
+            move = self._state_step(self._linearise(x, b, evidence), evidence, jnp.zeros_like(b))
+            lengths = jnp.array([1.0, 0.5, 0.25, 0.1], x.dtype)
+            costs = jax.vmap(lambda length: self._cost(x + length * move, b, evidence))(lengths)
+            best = jnp.argmin(costs)
+            better = costs[best] < cost
+            going = costs[best] < (1 - SETTLED) * cost
+            x = jnp.where(better, x + lengths[best] * move, x)
+            return x, jnp.minimum(costs[best], cost), going, count + 1
+
+        def unfinished(state):  # noqa: ANN001, ANN202
+            return state[2] & (state[3] < self.state_steps)
+
+        first = (x, self._cost(x, b, evidence), jnp.asarray(True), jnp.asarray(0))
+        return jax.lax.while_loop(unfinished, step, first)[0]
 
     def _linearise(
         self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence
@@ -216,5 +243,7 @@ class _Frame(eqx.Module):
     off: Float[Array, "n 3"]
 
 
+SETTLED = 0.5
+"""A step that lowers the cost by less than this share ends the search for the state."""
 FAINT = 1.0
 """Precision that keeps unseen, slack particles solvable: a standard deviation of 1 m [1/m^2]."""
