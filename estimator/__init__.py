@@ -1,4 +1,4 @@
-"""The estimator: perception, the surrogate's physics, and the belief over attachment stiffnesses. Never imports MuJoCo."""
+"""The estimator: perception, the surrogate's physics, and the belief over attachments. Never imports MuJoCo."""
 
 from jiggle_mj.estimator.estimator import Estimator, EstimatorConfig
 

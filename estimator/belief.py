@@ -2,8 +2,8 @@
 
     p(b) ~ exp(-1/2 b^T Lambda b + eta^T b)
 
-Evidence adds; a cut or a suture adds to the covariance, as in the paper's prediction step. float64 throughout: a float32
-covariance of 600 stiffnesses loses definiteness.
+Evidence adds; a cut or a suture adds to the covariance, as in the paper's prediction step. float64 throughout: a
+float32 covariance of 600 stiffnesses loses definiteness.
 """
 
 import equinox as eqx
@@ -31,7 +31,7 @@ class BoundaryBelief(eqx.Module):
         return BoundaryBelief(precision=self.precision + precision, shift=self.shift + shift)
 
     def predict(self, change: Float[Array, " n"], variance: Float[Array, " n"]) -> "BoundaryBelief":
-        """After a cut or suture: b + delta_b with noise of diagonal covariance W (paper's motion model) [N/m, N^2/m^2]."""
+        """After a cut or suture: b + delta_b [N/m] with noise of diagonal covariance W [N^2/m^2], the motion model."""
         mean, covariance = self.moments()
         covariance = covariance + jnp.diag(variance)
         precision = cho_solve((jnp.linalg.cholesky(covariance), True), jnp.eye(len(mean)))
@@ -47,17 +47,21 @@ class BoundaryBelief(eqx.Module):
         half_log_det = jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(self.precision))))
         return 0.5 * len(self.shift) * (1 + jnp.log(2 * jnp.pi)) - half_log_det
 
-    def non_negative_mean(self) -> Float[Array, " n"]:
+    def non_negative_mean(self, free: Bool[Array, " n"] | None = None) -> Float[Array, " n"]:
         """The most probable b >= 0: argmin 1/2 z^T Lambda z - eta^T z over z >= 0 [N/m].
+
+        `free` is a guess of the particles where it is above 0, to begin with.
 
         Block principal pivoting [Kim & Park 2011, doi:10.1137/110821172]: exchange all particles that break the
         conditions of optimality, and only one of them once exchanging all stops to help.
         """
-        return non_negative_minimum(self.precision, self.shift)
+        return non_negative_minimum(self.precision, self.shift, self.shift > 0 if free is None else free)
 
 
-def non_negative_minimum(precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> Float[Array, " n"]:
-    """argmin 1/2 z^T A z - c^T z over z >= 0 for a positive definite A; see `BoundaryBelief.non_negative_mean`."""
+def non_negative_minimum(
+    precision: Float[Array, "n n"], shift: Float[Array, " n"], free: Bool[Array, " n"]
+) -> Float[Array, " n"]:
+    """Argmin 1/2 z^T A z - c^T z over z >= 0 for a positive definite A; see `BoundaryBelief.non_negative_mean`."""
     n = len(shift)
     scale = jnp.sqrt(jnp.diagonal(precision))
     A, c = precision / scale[:, None] / scale[None, :], shift / scale
@@ -72,7 +76,7 @@ def non_negative_minimum(precision: Float[Array, "n n"], shift: Float[Array, " n
         z, dual = solve_on(free)
         return jnp.where(free, z < -tolerance, dual < -tolerance), z
 
-    def exchange(state):  # noqa: ANN001, ANN202
+    def exchange(state):
         free, bad, _, fewest, patience, count = state
         number = jnp.sum(bad)
         better = number < fewest
@@ -82,12 +86,11 @@ def non_negative_minimum(precision: Float[Array, "n n"], shift: Float[Array, " n
         bad, z = wrong(free)
         return free, bad, z, jnp.minimum(fewest, number), patience, count + 1
 
-    def unfinished(state):  # noqa: ANN001, ANN202
+    def unfinished(state):
         _, bad, _, _, _, count = state
         return jnp.any(bad) & (count < 5 * n)
 
-    start = c > 0
-    bad, z = wrong(start)
-    state = (start, bad, z, jnp.asarray(n + 1), jnp.asarray(3), jnp.asarray(0))
+    bad, z = wrong(free)
+    state = (free, bad, z, jnp.asarray(n + 1), jnp.asarray(3), jnp.asarray(0))
     free, _, z, _, _, _ = jax.lax.while_loop(unfinished, exchange, state)
     return jnp.where(free, jnp.maximum(z, 0), 0) / scale

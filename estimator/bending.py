@@ -1,14 +1,13 @@
 """Bending of the sheet: the quadratic isometric model over hinges [Bergou et al. 2006, doi:10.2312/SGP/SGP06/227-230].
 
-Resists a change of the mean curvature only. A hinge of area A weighs B / A, a third of the paper's 3 / A: with that a
-sheet bent to a cylinder of curvature c stores B c^2 / 2 per area, as a plate does (a test measures it). The curvature at
-rest turns with the hinge's normal, so that a sheet measured with some roughness is at rest where it was measured.
+Resists a change of the mean curvature only. A hinge of area A weighs B / A, a third of the paper's 3 / A: with that
+a sheet bent to a cylinder of curvature c stores B c^2 / 2 per area, as a plate does (a test measures it). The curvature
+at rest turns with the hinge's normal, so that a sheet measured with some roughness is at rest where it was measured.
 """
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-
 from jiggle_mj.estimator.energy import Term
 from jiggle_mj.estimator.mesh import SheetMesh
 
@@ -33,7 +32,7 @@ class IsometricBending(Term):
         first, second = np.cross(x1 - x0, x2 - x0), np.cross(x1 - x0, x3 - x0)
         area = 0.5 * (np.linalg.norm(first, axis=1) + np.linalg.norm(second, axis=1))
         weight = cotangent * np.sqrt(stiffness / area)[:, None]
-        curvature = np.sum(np.einsum("ha,hai->hi", weight, rest) * np.asarray(_normal(rest)), axis=1)
+        curvature = np.sum(np.einsum("ha,hai->hi", weight, rest) * np.asarray(_normal(jnp.asarray(rest))), axis=1)
         return cls(vertices=mesh.hinges, weight=jnp.asarray(weight), curvature=jnp.asarray(curvature))
 
     def energy(self, x: Float[Array, "h 4 3"]) -> Float[Array, " h"]:

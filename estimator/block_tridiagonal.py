@@ -1,7 +1,7 @@
 """Symmetric block-tridiagonal matrices over particles: layout, assembly from elements, Cholesky factorisation, solves.
 
-Particles ordered by reverse Cuthill-McKee [Cuthill & McKee 1969, doi:10.1145/800195.805928] interact only within a band;
-cutting the order into blocks as wide as the band leaves a block-tridiagonal matrix, whose Cholesky factor costs
+Particles ordered by reverse Cuthill-McKee [Cuthill & McKee 1969, doi:10.1145/800195.805928] interact only within a
+band; cutting the order into blocks as wide as the band leaves a block-tridiagonal matrix, whose Cholesky factor costs
 O(n band^2) instead of O(n^3). `Layout` holds the order, `BlockTridiagonal` the numbers. Every particle carries three
 degrees of freedom. Not a general sparse solver: the band must fit.
 """
@@ -36,13 +36,13 @@ class Layout(eqx.Module):
         n_blocks = max(1, len(order) // band)
         return cls(slot=rank, n_blocks=n_blocks, width=-(-len(order) // n_blocks))
 
-    def blocks(self, values: Float[Array, "n *rest"]) -> Float[Array, "blocks width *rest"]:
+    def blocks(self, values: Float[Array, "n ..."]) -> Float[Array, "blocks width ..."]:
         """Lay particle rows out in blocks; padding is zero."""
         rest = values.shape[1:]
         padded = jnp.zeros((self.n_blocks * self.width, *rest), values.dtype).at[self.slot].set(values)
         return padded.reshape(self.n_blocks, self.width, *rest)
 
-    def rows(self, blocks: Float[Array, "blocks width *rest"]) -> Float[Array, "n *rest"]:
+    def rows(self, blocks: Float[Array, "blocks width ..."]) -> Float[Array, "n ..."]:
         """The inverse of `blocks`."""
         return blocks.reshape(self.n_blocks * self.width, *blocks.shape[2:])[self.slot]
 
@@ -87,9 +87,7 @@ class BlockCholesky(eqx.Module):
     """Block (k + 1, k)."""
 
 
-def assemble(
-    layout: Layout, elements: list[tuple[Int[Array, "m p p"], Float[Array, "m p 3 p 3"]]]
-) -> BlockTridiagonal:
+def assemble(layout: Layout, elements: list[tuple[Int[Array, "m p p"], Float[Array, "m p 3 p 3"]]]) -> BlockTridiagonal:
     """Sum element matrices, each given with its `Layout.pair_index`; padding gets an identity."""
     nb, w = layout.n_blocks, layout.width
     index = jnp.concatenate([i.reshape(-1) for i, _ in elements])
@@ -97,7 +95,10 @@ def assemble(
     storage = jnp.zeros((2 * nb * w * w + 1, 3, 3), windows.dtype).at[index].add(windows)
     blocks = storage[:-1].reshape(2, nb, w, w, 3, 3).swapaxes(3, 4).reshape(2, nb, 3 * w, 3 * w)
     return add_to_diagonal(
-        layout, BlockTridiagonal(diagonal=blocks[0], lower=blocks[1, : nb - 1]), jnp.zeros((len(layout.slot), 3, 3)), 1.0
+        layout,
+        BlockTridiagonal(diagonal=blocks[0], lower=blocks[1, : nb - 1]),
+        jnp.zeros((len(layout.slot), 3, 3)),
+        1.0,
     )
 
 
@@ -117,7 +118,7 @@ def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
     """Factor A = L L^T block by block; NaN where A is not positive definite."""
     identity = jnp.eye(matrix.diagonal.shape[1], dtype=matrix.diagonal.dtype)
 
-    def step(previous, blocks):  # noqa: ANN001, ANN202
+    def step(previous, blocks):
         diagonal, lower = blocks
         coupling = lower @ previous.T
         factor = jnp.linalg.cholesky(diagonal - coupling @ coupling.T, symmetrize_input=False)
@@ -142,7 +143,7 @@ def multiply(layout: Layout, matrix: BlockTridiagonal, x: Float[Array, "n 3"]) -
 def solve_lower(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float[Array, "blocks m k"]:
     """L z = rhs."""
 
-    def step(previous, blocks):  # noqa: ANN001, ANN202
+    def step(previous, blocks):
         inverse, lower, right = blocks
         z = inverse @ (right - lower @ previous)
         return z, z
@@ -154,7 +155,7 @@ def solve_lower(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float
 def solve_upper(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float[Array, "blocks m k"]:
     """L^T z = rhs."""
 
-    def step(following, blocks):  # noqa: ANN001, ANN202
+    def step(following, blocks):
         inverse, lower, right = blocks
         z = inverse.T @ (right - lower.T @ following)
         return z, z

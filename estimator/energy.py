@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-
 from jiggle_mj.estimator.block_tridiagonal import BlockTridiagonal, Layout, add_to_diagonal, assemble
 
 
@@ -54,7 +53,7 @@ class SheetEnergy(eqx.Module):
     """Anchors a of the boundary springs [m]."""
     terms: tuple[Term, ...]
     layout: Layout
-    places: tuple[Int[Array, "m p p"], ...]
+    places: tuple[Int[Array, "_m _p _p"], ...]
 
     @classmethod
     def build(cls, rest: Float[np.ndarray, "n 3"], terms: tuple[Term, ...], layout: Layout) -> "SheetEnergy":

@@ -6,7 +6,6 @@ Each is a `Term` with one particle an element. The bed is frictionless and only 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-
 from jiggle_mj.estimator.energy import Term
 
 
@@ -75,12 +74,12 @@ class Bed(Term):
 
     def gradient(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3"]:
         """[N]."""
-        return (self.stiffness * self._depth(x)[:, None] * self.up)[:, None]
+        return self.stiffness * jnp.outer(self._depth(x), self.up)[:, None]
 
     def hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
         """The bed's stiffness where it is touched [N/m]."""
         touched = jnp.where(self._depth(x) < 0, self.stiffness, 0)
-        return (touched[:, None, None] * jnp.outer(self.up, self.up))[:, None, :, None, :]
+        return (touched[:, None, None] * jnp.outer(self.up, self.up)[None])[:, None, :, None, :]
 
     def positive_hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
         """The Hessian, which is semi-definite already."""
@@ -99,11 +98,9 @@ class Grip(Term):
     """k_a [N/m], zero for particles that are not held."""
 
     @classmethod
-    def build(
-        cls, x: Float[Array, "n 3"], tip: Float[Array, " 3"], *, radius: float, stiffness: float
-    ) -> "Grip":
+    def build(cls, x: Float[Array, "n 3"], tip: Float[Array, " 3"], *, radius: float, stiffness: float) -> "Grip":
         """Close the jaws at `tip` around the particles x within the radius."""
-        length = jnp.linalg.norm(x - tip, axis=1)
+        length = jnp.linalg.norm(x - tip[None], axis=1)
         return cls(
             vertices=np.arange(len(x))[:, None],
             tip=tip,
@@ -112,7 +109,7 @@ class Grip(Term):
         )
 
     def _stretch(self, x: Float[Array, "n 1 3"]) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
-        d = x[:, 0] - self.tip
+        d = x[:, 0] - self.tip[None]
         squared = jnp.sum(d**2, axis=1)
         return d, jnp.sqrt(jnp.where(squared > 0, squared, jnp.finfo(x.dtype).tiny))
 
@@ -125,7 +122,7 @@ class Grip(Term):
         d, distance = self._stretch(x)
         along = jnp.einsum("ni,nj->nij", d, d) / distance[:, None, None] ** 2
         across = jnp.maximum(1 - self.length / distance, 0)[:, None, None]
-        window = along + across * (jnp.eye(3, dtype=x.dtype) - along)
+        window = along + across * (jnp.eye(3, dtype=x.dtype)[None] - along)
         return (self.stiffness[:, None, None] * window)[:, None, :, None, :]
 
 

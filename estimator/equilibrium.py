@@ -1,7 +1,7 @@
-"""The sheet's equilibrium x*(b, u) = argmin U by projected Newton, and its derivatives by the implicit function theorem.
+"""The sheet's equilibrium x*(b, u) = argmin U by projected Newton, differentiated by the implicit function theorem.
 
 Each step factors the positive semi-definite stand-in of the Hessian and backtracks until the energy falls enough
-[Nocedal & Wright 2006, Numerical Optimization, alg. 3.1]. Derivatives use the true Hessian at the solution:
+(Armijo's rule). Derivatives use the true Hessian at the solution:
 dx/dtheta = -H^-1 d(grad U)/dtheta. A step that cannot lower the energy ends the search and is reported, not hidden.
 """
 
@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
-
 from jiggle_mj.estimator.block_tridiagonal import add_to_diagonal, cholesky, multiply, solve
 from jiggle_mj.estimator.energy import SheetEnergy
 
@@ -30,7 +29,7 @@ def equilibrium(
     b: Float[Array, " n"],
     start: Float[Array, "n 3"],
     *,
-    force_tolerance: float = 1e-8,
+    force_tolerance: float | Array = 1e-8,
     max_steps: int = 200,
 ) -> Equilibrium:
     """Minimise U(x; b) from `start` until no particle feels more than `force_tolerance` [N].
@@ -43,15 +42,15 @@ def equilibrium(
     return Equilibrium(x=x, force=force, steps=steps, converged=force <= force_tolerance)
 
 
-def _search(dynamic, static, b, start, force_tolerance, max_steps):  # noqa: ANN001, ANN202
+def _search(dynamic, static, b, start, force_tolerance, max_steps):
     """The implicitly differentiated search; see `equilibrium`."""
 
     @jax.custom_jvp
-    def solution(dynamic, b):  # noqa: ANN001, ANN202
+    def solution(dynamic, b):
         return _minimise(eqx.combine(dynamic, static), b, start, force_tolerance, max_steps)
 
     @solution.defjvp
-    def tangent(primals, tangents):  # noqa: ANN001, ANN202
+    def tangent(primals, tangents):
         out = solution(*primals)
         x = out[0]
         _, change = jax.jvp(lambda d, b: eqx.combine(d, static).gradient(x, b), primals, tangents)
@@ -63,7 +62,7 @@ def _search(dynamic, static, b, start, force_tolerance, max_steps):  # noqa: ANN
     return solution(dynamic, b)
 
 
-def _implicit_solve(energy, matrix, rhs):  # noqa: ANN001, ANN202
+def _implicit_solve(energy, matrix, rhs):
     """H^-1 rhs with a transpose rule, so that reverse mode goes through it."""
     layout = energy.layout
     return jax.lax.custom_linear_solve(
@@ -74,11 +73,11 @@ def _implicit_solve(energy, matrix, rhs):  # noqa: ANN001, ANN202
     )
 
 
-def _minimise(energy, b, start, force_tolerance, max_steps):  # noqa: ANN001, ANN202
+def _minimise(energy, b, start, force_tolerance, max_steps):
     """Projected Newton with backtracking; returns x, the largest force, and the number of steps."""
     layout = energy.layout
 
-    def newton(state):  # noqa: ANN001, ANN202
+    def newton(state):
         x, value, gradient, count, _ = state
         matrix = energy.hessian(x, b, positive=True)
         shift = 1e-9 * jnp.max(jnp.abs(matrix.diagonal))
@@ -86,11 +85,11 @@ def _minimise(energy, b, start, force_tolerance, max_steps):  # noqa: ANN001, AN
         step = solve(layout, cholesky(matrix), -gradient)
         slope = jnp.sum(step * gradient)
 
-        def too_far(trial):  # noqa: ANN001, ANN202
+        def too_far(trial):
             length, new = trial
             return (~(new <= value + 1e-4 * length * slope + 1e-15 * jnp.abs(value))) & (length > 1e-8)
 
-        def halve(trial):  # noqa: ANN001, ANN202
+        def halve(trial):
             length, _ = trial
             return length / 2, energy.value(x + length / 2 * step, b)
 
@@ -99,7 +98,7 @@ def _minimise(energy, b, start, force_tolerance, max_steps):  # noqa: ANN001, AN
         moved = jnp.where(stuck, x, x + length * step)
         return moved, jnp.where(stuck, value, new), energy.gradient(moved, b), count + 1, stuck
 
-    def unfinished(state):  # noqa: ANN001, ANN202
+    def unfinished(state):
         _, _, gradient, count, stuck = state
         return (jnp.max(jnp.abs(gradient)) > force_tolerance) & (count < max_steps) & ~stuck
 

@@ -1,7 +1,7 @@
 """The estimator's front: observations in, estimates out.
 
-While the sheet lies still before the first grasp, frames only fix where it rests. Then every frame with closed jaws goes
-perception -> grip -> filter. Sees nothing but observations, the camera's calibration and the declaration.
+While the sheet lies still before the first grasp, frames only fix where it rests. Then every frame with closed jaws
+goes perception -> grip -> filter. Sees nothing but observations, the camera's calibration and the declaration.
 """
 
 import time
@@ -12,17 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-
-from jiggle_mj.camera import StereoCamera
-from jiggle_mj.errors import PerceptionError
-from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.estimator.belief import BoundaryBelief
-from jiggle_mj.estimator.filters.implicit import Evidence, ImplicitFilter, Update
+from jiggle_mj.estimator.filters.implicit import Evidence, ImplicitFilter
 from jiggle_mj.estimator.grip import GripHold
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.perception import Disparity, PointTracker, StereoTracker, TissueMask, Track
 from jiggle_mj.estimator.perception.mesh_field import MeshField
 from jiggle_mj.estimator.surrogate import Membrane, surrogate
+
+from jiggle_mj.camera import StereoCamera
+from jiggle_mj.errors import PerceptionError
+from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
@@ -113,7 +113,9 @@ class Estimator:
         """Which particles are called attached so far."""
         limit = self.config.detect_above * self.declaration.membrane_stiffness
         return Detection(
-            attached=self._b > limit, score=self._b, rule=f"non-negative mean of b > {self.config.detect_above:g} k = {limit:.3g} N/m"
+            attached=self._b > limit,
+            score=self._b,
+            rule=f"non-negative mean of b > {self.config.detect_above:g} k = {limit:.3g} N/m",
         )
 
     def update(self, observation: Observation) -> Estimate | None:
@@ -131,7 +133,7 @@ class Estimator:
             self._look_at_rest(observation)
             if not tool.closed:
                 return None
-            self._begin()
+            self._filter = self._begin()
         if not tool.closed:
             self._hold = None
             return None
@@ -141,7 +143,15 @@ class Estimator:
         if not track.visible.any():
             self.skipped.append((observation.index, "no particle was seen"))
             return None
-        update = self._take_in(track, tool)
+        hold, before = self._grip(track, tool)
+        evidence, start = self._evidence(track, tool, hold, before)
+        update = _update(self._filter, self._belief, jnp.asarray(self._b), evidence, jnp.asarray(start))
+        self._hold, self._belief = hold, update.belief
+        self._x, self._b = np.asarray(update.x), np.asarray(update.b)
+        if not np.isfinite(self._x).all():
+            raise PerceptionError(
+                f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
+            )
         return Estimate(
             index=observation.index,
             time=observation.time,
@@ -149,7 +159,7 @@ class Estimator:
             observed=track.positions,
             mean=self._b,
             sd=np.sqrt(np.diagonal(np.asarray(self._belief.moments()[1]))),
-            held=self._hold.held,
+            held=hold.held,
             entropy=float(self._belief.entropy()),
             nis=float(update.nis),
             boundary_energy=0.5 * float(np.mean(self._b * np.sum((self._x - self.sheet.rest) ** 2, axis=1))),
@@ -167,24 +177,24 @@ class Estimator:
                 self._still.append(observation.points)
         else:
             raise PerceptionError(
-                f"observation {observation.index} has neither points nor images with a calibrated camera; one is needed."
+                f"observation {observation.index} has neither points nor images with a calibrated camera."
             )
 
-    def _begin(self) -> None:
+    def _begin(self) -> ImplicitFilter:
         """Build the model once the rest shape is known."""
         if self._sheet is None:
             self._sheet = self._points.start(self._still)
         mesh, k = SheetMesh(self._sheet.rest, self._sheet.faces), self.declaration.membrane_stiffness
-        self._filter = ImplicitFilter.build(
+        self._field = MeshField(SheetPlane.through(mesh.rest).flatten(mesh.rest), mesh.faces)
+        self._belief = BoundaryBelief.prior(mesh.n, mean=0.0, sd=self.config.prior_sd * k)
+        self.prior_entropy = float(self._belief.entropy())
+        self._x, self._b = mesh.rest, np.zeros(mesh.n)
+        return ImplicitFilter.build(
             mesh,
             surrogate(mesh, self.declaration, membrane=self.config.membrane),
             force_sd=self.config.force_sd * k * mesh.spacing,
             grip_stiffness=self.config.grip_stiffness * k,
         )
-        self._field = MeshField(SheetPlane.through(mesh.rest).flatten(mesh.rest), mesh.faces)
-        self._belief = BoundaryBelief.prior(mesh.n, mean=0.0, sd=self.config.prior_sd * k)
-        self.prior_entropy = float(self._belief.entropy())
-        self._x, self._b = mesh.rest, np.zeros(mesh.n)
 
     def _see(self, observation: Observation) -> Track:
         if observation.images is not None and self._stereo is not None:
@@ -193,16 +203,19 @@ class Estimator:
             return self._points.track(observation.points)
         raise PerceptionError(f"observation {observation.index} has neither points nor images; one is needed.")
 
-    def _take_in(self, track: Track, tool: ToolState) -> Update:
-        """Fuse what was seen with what the grip says, and update state and belief."""
-        seen = track.visible
-        if self._hold is None or self._hold.grasp != tool.grasp:
-            before = self.sheet.rest
-            at_closing = np.where(seen[:, None], np.nan_to_num(track.positions), before)
-            self._hold = GripHold.close(tool, at_closing, self._named(tool))
-        else:
-            before = self._x
-        held, expected = self._hold.held, self._hold.expected(tool)
+    def _grip(self, track: Track, tool: ToolState) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
+        """The grasp of this frame, and the state to start from: the last, or rest where the jaws have just closed."""
+        if self._hold is not None and self._hold.grasp == tool.grasp:
+            return self._hold, self._x
+        rest = self.sheet.rest
+        at_closing = np.where(track.visible[:, None], np.nan_to_num(track.positions), rest)
+        return GripHold.close(tool, at_closing, self._named(tool)), rest
+
+    def _evidence(
+        self, track: Track, tool: ToolState, hold: GripHold, before: Float[np.ndarray, "n 3"]
+    ) -> tuple[Evidence, Float[np.ndarray, "n 3"]]:
+        """Fuse what was seen with what the grip says; and a start for the state, smooth where nothing was seen."""
+        seen, held, expected = track.visible, hold.held, hold.expected(tool)
         precision = np.where(seen[:, None, None], np.linalg.inv(track.covariance), 0.0)
         weighed = np.einsum("nij,nj->ni", precision, np.nan_to_num(track.positions))
         grip = np.where(held, self.config.grip_sd**-2, 0.0)
@@ -210,18 +223,14 @@ class Estimator:
         weighed = weighed + grip[:, None] * expected
         known = seen | held
         y = np.where(
-            known[:, None], np.linalg.solve(np.where(known[:, None, None], precision, np.eye(3)), weighed[..., None])[..., 0], 0
+            known[:, None],
+            np.linalg.solve(np.where(known[:, None, None], precision, np.eye(3)), weighed[..., None])[..., 0],
+            0,
         )
         motion = np.where(known[:, None], y - before, 0.0)
         start = before + np.where(known[:, None], motion, self._field.fill(motion, known))
-        evidence = Evidence(
-            y=jnp.asarray(np.where(known[:, None], y, start)), precision=jnp.asarray(precision), held=jnp.asarray(held)
-        )
-        update = _update(self._filter, self._belief, jnp.asarray(self._b), evidence, jnp.asarray(start))
-        self._belief, self._x, self._b = update.belief, np.asarray(update.x), np.asarray(update.b)
-        if not np.isfinite(self._x).all():
-            raise PerceptionError("the filter's state is not finite: the observation cannot be explained by any sheet.")
-        return update
+        y = np.where(known[:, None], y, start)
+        return Evidence(y=jnp.asarray(y), precision=jnp.asarray(precision), held=jnp.asarray(held)), start
 
     def _named(self, tool: ToolState) -> Bool[np.ndarray, " n"] | None:
         """Particles that the recording or the declaration says are held."""

@@ -38,8 +38,8 @@ class GripHold:
         if not held.any():
             raise PerceptionError(
                 f"grasp {tool.grasp} is off the tissue: the tip at {np.round(tool.position, 4).tolist()} m is "
-                f"{distance.min() * 1e3:.1f} mm from the nearest particle, and the jaws reach {tool.radius * 1e3:.1f} mm "
-                "(check the tool pose, the camera pose, or the radius)."
+                f"{distance.min() * 1e3:.1f} mm from the nearest particle, and the jaws reach "
+                f"{tool.radius * 1e3:.1f} mm (check the tool pose, the camera pose, or the radius)."
             )
         return cls(grasp=tool.grasp, held=held, closed_at=positions, tip=tool.position)
 

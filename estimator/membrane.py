@@ -7,7 +7,6 @@ bending. Small strains, large rotations.
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-
 from jiggle_mj.estimator.energy import Term
 from jiggle_mj.estimator.mesh import SheetMesh
 
@@ -16,7 +15,7 @@ class TriangleMembrane(Term):
     """Constant-strain St Venant-Kirchhoff triangles in plane stress.
 
     With F the deformation gradient, E = (F^T F - I) / 2 and S = k / (1 - nu^2) ((1 - nu) E + nu tr(E) I), a triangle of
-    rest area A stores A/2 S:E [Bonet & Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, ch. 6].
+    rest area A stores A/2 S:E.
     """
 
     vertices: Int[np.ndarray, "f 3"] | Int[Array, "f 3"]
@@ -90,7 +89,7 @@ class EdgeMembrane(Term):
     """Distance springs along the edges, the paper's C_m, with Van Gelder's stiffness.
 
     Edge e of rest length l between triangles of area A_1, A_2 gets k_e = k (A_1 + A_2) / l^2 [Van Gelder 1998,
-    doi:10.1080/10867651.1998.10487490]: exact for equilateral triangles and Poisson's ratio 1/3, which springs have.
+    Journal of Graphics Tools 3(2)]: exact for equilateral triangles and Poisson's ratio 1/3, which springs have.
     """
 
     vertices: Int[np.ndarray, "e 2"] | Int[Array, "e 2"]
@@ -108,9 +107,7 @@ class EdgeMembrane(Term):
         for face, size in zip(mesh.faces.tolist(), mesh.face_area, strict=True):
             for a, b in zip(face, face[1:] + face[:1], strict=True):
                 area[number[min(a, b), max(a, b)]] += size
-        return cls(
-            vertices=mesh.edges, length=jnp.asarray(length), stiffness=jnp.asarray(stiffness * area / length**2)
-        )
+        return cls(vertices=mesh.edges, length=jnp.asarray(length), stiffness=jnp.asarray(stiffness * area / length**2))
 
     def energy(self, x: Float[Array, "e 2 3"]) -> Float[Array, " e"]:
         """k_e/2 (|x_1 - x_0| - l)^2 [J]."""

@@ -7,13 +7,13 @@ membrane stiffness, because positions know only ratios.
 from typing import Literal
 
 import numpy as np
-
 from jiggle_mj.estimator.bending import IsometricBending
 from jiggle_mj.estimator.block_tridiagonal import Layout
 from jiggle_mj.estimator.energy import SheetEnergy, Term
 from jiggle_mj.estimator.environment import Bed, Weight
 from jiggle_mj.estimator.membrane import EdgeMembrane, TriangleMembrane
 from jiggle_mj.estimator.mesh import SheetMesh
+
 from jiggle_mj.observation import Declaration
 
 BED_STIFFNESS = 1 / 3
@@ -34,7 +34,9 @@ def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane =
     terms: list[Term] = [elastic, IsometricBending.build(mesh, stiffness=plate)]
     gravity = np.asarray(declaration.gravity, dtype=float)
     if gravity.any():
-        terms.append(Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=declaration.gravity))
+        terms.append(
+            Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=declaration.gravity)
+        )
         if declaration.bed:
             terms.append(Bed.build(mesh.rest, up=-gravity / np.linalg.norm(gravity), stiffness=BED_STIFFNESS * k))
     return SheetEnergy.build(mesh.rest, tuple(terms), Layout.from_pattern(mesh.adjacency))

@@ -9,6 +9,12 @@ from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 
+from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.eval.report import shown_steps, write_report
+from jiggle_mj.eval.score import Json, result, score, write_result
+from jiggle_mj.scenes import Reference, Scene, programme
+from jiggle_mj.scenes.reference import Sensing
+
 from jiggle_mj.episode import (
     ESTIMATE,
     RECORDING,
@@ -23,14 +29,9 @@ from jiggle_mj.episode import (
 )
 from jiggle_mj.errors import OutputError
 from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
-from jiggle_mj.estimator import Estimator, EstimatorConfig
-from jiggle_mj.eval.report import shown_steps, write_report
-from jiggle_mj.eval.score import Json, result, score, write_result
 from jiggle_mj.importing import truth_path
 from jiggle_mj.observation import StereoPair
 from jiggle_mj.recording import Recording
-from jiggle_mj.scenes import Reference, Scene, programme
-from jiggle_mj.scenes.reference import Sensing
 from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import read_truth
 

@@ -62,9 +62,7 @@ def run(
     _show(figures, out, as_json)
 
 
-def record(
-    scene: Name, /, *, out: Out, sensing: Sensing = "stereo", seed: int = 0, overwrite: bool = False
-) -> None:
+def record(scene: Name, /, *, out: Out, sensing: Sensing = "stereo", seed: int = 0, overwrite: bool = False) -> None:
     """The reference tissue alone: observations to OUT, the truth to a file of its own beside it.
 
     Args:
@@ -88,7 +86,13 @@ def record(
 
 
 def import_(
-    folder: PathArgument, /, *, out: Out, recording: Path | None = None, overwrite: bool = False, as_json: AsJson = False
+    folder: PathArgument,
+    /,
+    *,
+    out: Out,
+    recording: Path | None = None,
+    overwrite: bool = False,
+    as_json: AsJson = False,
 ) -> None:
     """A folder of measured data into a recording.
 
@@ -135,9 +139,7 @@ def estimate(
 
     length = len(Recording.open(recording, allow_truncated=allow_truncated))
     with _progress(length, f"estimate {recording.name}") as on_frame:
-        figures = run_estimator(
-            recording, out, overwrite=overwrite, allow_truncated=allow_truncated, on_frame=on_frame
-        )
+        figures = run_estimator(recording, out, overwrite=overwrite, allow_truncated=allow_truncated, on_frame=on_frame)
     _show(figures, out, as_json)
 
 
@@ -214,11 +216,15 @@ def _progress(total: int, title: str) -> "Iterator[OnFrame]":
 def _show(figures: dict, out: Path, as_json: bool) -> None:
     """What was found, in a few lines; the whole of it with --json."""
     detection, calibration = figures["detection"], figures["calibration"]
-    console.print(f"{detection['n_detected']} of {figures['n_particles']} particles reported attached ({detection['rule']})")
+    console.print(
+        f"{detection['n_detected']} of {figures['n_particles']} particles reported attached ({detection['rule']})"
+    )
     if detection["n_attached"] is not None:
         table = Table("rings", "PCD %", "PUG %", "F1 %", box=None)
         for rings, one in detection["by_dilation"].items():
-            table.add_row(rings, *("-" if one[name] is None else f"{100 * one[name]:.1f}" for name in ("pcd", "pug", "f1")))
+            table.add_row(
+                rings, *("-" if one[name] is None else f"{100 * one[name]:.1f}" for name in ("pcd", "pug", "f1"))
+            )
         console.print(table)
         parts = [f"{detection['n_attached']} truly attached"]
         if calibration["nees_per_dof"] is not None:

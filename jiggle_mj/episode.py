@@ -160,8 +160,8 @@ def estimate(
         if not estimates:
             why = "; ".join(f"frame {index}: {reason}" for index, reason in estimator.skipped[:3])
             raise PerceptionError(
-                f"no frame could be used ({why or 'none has closed jaws'}); the estimator learns from frames in which the "
-                "tool holds the tissue."
+                f"no frame could be used ({why or 'none has closed jaws'}); the estimator learns from frames in which "
+                "the tool holds the tissue."
             )
         if writer is not None:
             writer.finish(estimator.belief, estimator.detection, skipped=estimator.skipped)

@@ -3,19 +3,18 @@
     y = x + n_y,  n_y ~ N(0, R)         observed positions, a 3x3 block a particle, no row for a missing one
     grad U(x; b) = n_f,  n_f ~ N(0, tau^2 I)    what the model gets wrong, in newtons; no row for a held particle
 
-Gauss-Newton on (x, b), from the equilibrium of the sheet tethered to what was observed. With H the Hessian of U, D = blkdiag(x_i - a_i), W = tau^-2 (0 where held),
-A = R^-1 + H W H and N^-1 = W - W H A^-1 H W, eliminating x leaves for b the evidence D^T N^-1 D; each frame enters once.
-Linear in b at the observed state, so the wild response of a free sheet at b = 0 is never needed. The equilibrium condition
-as an implicit measurement follows the errors-in-variables form of the Gauss-Helmert model [Foerstner & Wrobel 2016,
-Photogrammetric Computer Vision, sec. 4.8]. Needs correspondences.
+Gauss-Newton on (x, b), from the equilibrium of the sheet tethered to what was observed. With H the Hessian of U,
+D = blkdiag(x_i - a_i), W = tau^-2 (0 where held), A = R^-1 + H W H and N^-1 = W - W H A^-1 H W, eliminating x leaves
+for b the evidence D^T N^-1 D; each frame enters once. Linear in b at the observed state, so the wild response of a free
+sheet at b = 0 is never needed. Needs correspondences.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
-
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.block_tridiagonal import (
     BlockCholesky,
@@ -63,7 +62,7 @@ class ImplicitFilter(eqx.Module):
     """The same, with springs to the observed positions as its last term."""
     neighbours: Int[Array, "n p"]
     """Particles coupled to each, itself included, padded with n."""
-    slots: tuple[Int[Array, "m p p"], ...]
+    slots: tuple[Int[Array, "_m _p _p"], ...]
     """Where each term's Hessian windows go in the rows of H."""
     layout: Layout
     """Twice the energy's band: the pattern of H^2."""
@@ -80,7 +79,7 @@ class ImplicitFilter(eqx.Module):
         cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, grip_stiffness: float, state_steps: int = 8
     ) -> "ImplicitFilter":
         """Prepare the index tables for a mesh and its energy; force_sd [N], grip_stiffness [N/m]."""
-        near = mesh.adjacency.tocsr()
+        near = sp.csr_array(mesh.adjacency)
         near.sort_indices()
         degree = np.diff(near.indptr)
         neighbours = np.full((mesh.n, degree.max()), -1)
@@ -92,8 +91,8 @@ class ImplicitFilter(eqx.Module):
             jnp.asarray([[[i * width + position[i, j] for j in element] for i in element] for element in vertices])
             for vertices in (np.asarray(term.vertices).tolist() for term in energy.terms)
         )
-        two_rings = (near.astype(int) @ near.astype(int)).tocoo()
-        layout = Layout.from_pattern(pattern(mesh.n, np.column_stack([two_rings.row, two_rings.col])))
+        coupled = sp.csr_array(near.astype(np.int64) @ near.astype(np.int64))
+        layout = Layout.from_pattern(pattern(mesh.n, np.column_stack(coupled.nonzero())))
         return cls(
             energy=energy,
             tethered=SheetEnergy.build(mesh.rest, (*energy.terms, Tether.build(mesh.rest)), energy.layout),
@@ -117,13 +116,11 @@ class ImplicitFilter(eqx.Module):
             evidence: what was seen.
             start: where the search for the state begins [m].
         """
-        x = self._settle(start, b, evidence)
-        x = self._refine(x, b, evidence)
-        frame = self._linearise(x, b, evidence)
+        frame = self._approach(self._settle(start, b, evidence), b, evidence)
         gained, shift = self._information(frame, b)
         belief = belief.add(gained, shift)
-        b, before = belief.non_negative_mean(), b
-        x = x + self._state_step(frame, evidence, b - before)
+        b = belief.non_negative_mean(b > 0)
+        x = self._polish(frame, b, evidence)
         observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
         degrees = observed - 3 * jnp.sum(evidence.held)
         return Update(belief=belief, x=x, b=b, nis=2 * self._cost(x, b, evidence) / jnp.maximum(degrees, 1))
@@ -150,38 +147,53 @@ class ImplicitFilter(eqx.Module):
         tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
         return equilibrium(tethered, b, x, force_tolerance=self.force_sd / 40, max_steps=25).x
 
-    def _refine(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
-        """State-only Gauss-Newton steps at fixed b, until one gains less than `SETTLED` of the cost."""
+    def _approach(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> "_Frame":
+        """Linearise where a Gauss-Newton step on the state alone, at fixed b, gains no more than `SETTLED`."""
 
-        def step(state):  # noqa: ANN001, ANN202
-            x, cost, _, count = state
-            move = self._state_step(self._linearise(x, b, evidence), evidence, jnp.zeros_like(b))
-            lengths = jnp.array([1.0, 0.5, 0.25, 0.1], x.dtype)
-            costs = jax.vmap(lambda length: self._cost(x + length * move, b, evidence))(lengths)
-            best = jnp.argmin(costs)
-            better = costs[best] < cost
-            going = costs[best] < (1 - SETTLED) * cost
-            x = jnp.where(better, x + lengths[best] * move, x)
-            return x, jnp.minimum(costs[best], cost), going, count + 1
+        def look(x: Float[Array, "n 3"]) -> tuple["_Frame", Float[Array, "n 3"], Bool[Array, ""]]:
+            frame = self._linearise(x, b, evidence)
+            following, cost = self._best_along(x, self._state_step(frame, x, b, evidence), b, evidence)
+            return frame, following, cost < (1 - SETTLED) * self._cost(x, b, evidence)
 
-        def unfinished(state):  # noqa: ANN001, ANN202
+        def step(state):
+            _, following, _, count = state
+            return *look(following), count + 1
+
+        def unfinished(state):
             return state[2] & (state[3] < self.state_steps)
 
-        first = (x, self._cost(x, b, evidence), jnp.asarray(True), jnp.asarray(0))
-        return jax.lax.while_loop(unfinished, step, first)[0]
+        return jax.lax.while_loop(unfinished, step, (*look(x), jnp.asarray(1)))[0]
 
-    def _linearise(
-        self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence
-    ) -> "_Frame":
+    def _polish(self, frame: "_Frame", b: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
+        """The state for a new b, by a few steps with the factor at hand."""
+
+        def step(_, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+            return self._best_along(x, self._state_step(frame, x, b, evidence), b, evidence)[0]
+
+        return jax.lax.fori_loop(0, POLISH_STEPS, step, frame.x)
+
+    def _best_along(
+        self, x: Float[Array, "n 3"], move: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence
+    ) -> tuple[Float[Array, "n 3"], Float[Array, ""]]:
+        """The point of least cost among a few along a move, and that cost."""
+        lengths = jnp.array([0.0, 0.1, 0.25, 0.5, 1.0], x.dtype)
+        costs = jax.vmap(lambda length: self._cost(x + length * move, b, evidence))(lengths)
+        best = jnp.nanargmin(costs)
+        return x + lengths[best] * move, costs[best]
+
+    def _rows(self, x: Float[Array, "n 3"], b: Float[Array, " n"]) -> Float[Array, "n p 3 3"]:
+        """H, the windows of each particle's row beside one another."""
         n, width = self.neighbours.shape
         rows = jnp.zeros((n * width, 3, 3), x.dtype)
         for term, slot in zip(self.energy.terms, self.slots, strict=True):
             windows = jnp.swapaxes(term.hessian(x[term.vertices]), 2, 3).reshape(-1, 3, 3)
             rows = rows.at[slot.reshape(-1)].add(windows)
-        rows = rows.reshape(n, width, 3, 3)
         itself = self.neighbours == jnp.arange(n)[:, None]
-        rows = rows + jnp.where(itself[:, :, None, None], (b[:, None, None] * jnp.eye(3))[:, None], 0.0)
-        weight = self._force_weight(evidence)
+        boundary = jnp.where(itself[:, :, None, None], (b[:, None, None] * jnp.eye(3))[:, None], 0.0)
+        return rows.reshape(n, width, 3, 3) + boundary
+
+    def _linearise(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> "_Frame":
+        rows, weight = self._rows(x, b), self._force_weight(evidence)
         squares = jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows)
         matrix = assemble(self.layout, [(self.places, squares)])
         matrix = add_to_diagonal(self.layout, matrix, evidence.precision + FAINT * jnp.eye(3))
@@ -200,16 +212,15 @@ class ImplicitFilter(eqx.Module):
         parts = jnp.einsum("npij,ni->npj", rows, v)
         return jnp.zeros((len(v) + 1, 3), v.dtype).at[self.neighbours].add(parts)[:-1]
 
-    def _state_step(self, frame: "_Frame", evidence: Evidence, change: Float[Array, " n"]) -> Float[Array, "n 3"]:
-        """The best move of x for a given change of b."""
-        force = frame.gradient + frame.d * change[:, None]
-        pull = jnp.einsum("nij,nj->ni", evidence.precision, frame.off)
-        rhs = pull - self._transposed(frame.rows, frame.weight[:, None] * force)
-        return solve(self.layout, frame.factor, rhs)
+    def _state_step(
+        self, frame: "_Frame", x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence
+    ) -> Float[Array, "n 3"]:
+        """Move of the state at x for fixed b, with the factor of `frame`; Gauss-Newton's if x is its state."""
+        pull = jnp.einsum("nij,nj->ni", evidence.precision, evidence.y - x)
+        push = self._transposed(self._rows(x, b), frame.weight[:, None] * self.energy.gradient(x, b))
+        return solve(self.layout, frame.factor, pull - push)
 
-    def _information(
-        self, frame: "_Frame", b: Float[Array, " n"]
-    ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    def _information(self, frame: "_Frame", b: Float[Array, " n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
         """D^T N^-1 D and the shift that goes with it."""
         n, width = self.neighbours.shape
         layout, w = self.layout, frame.weight
@@ -245,5 +256,7 @@ class _Frame(eqx.Module):
 
 SETTLED = 0.5
 """A step that lowers the cost by less than this share ends the search for the state."""
+POLISH_STEPS = 4
+"""Steps of the state after the belief has changed."""
 FAINT = 1.0
 """Precision that keeps unseen, slack particles solvable: a standard deviation of 1 m [1/m^2]."""

@@ -57,7 +57,7 @@ class PointTracker:
         found = _by_id(points)
         unseen = np.full(3, np.nan)
         positions = np.array([found.get(int(i), unseen) for i in self.ids])
-        visible = np.isfinite(positions).all(axis=1)
+        visible = np.asarray(np.isfinite(positions).all(axis=1))
         variance = np.where(visible, points.sd**2 + self._rest_variance, UNSEEN_VARIANCE)
         return Track(positions=positions, covariance=variance[:, None, None] * np.eye(3), visible=visible)
 
@@ -66,7 +66,7 @@ def _by_id(points: MeasuredPoints) -> dict[int, np.ndarray]:
     """Finite points by their identity."""
     if points.track_id is None:
         raise PerceptionError(
-            "the points carry no track_id; the filter needs to know which point is which (track them, or record images)."
+            "the points carry no track_id; the filter must know which point is which (track them, or record images)."
         )
     seen = np.isfinite(points.positions).all(axis=1) & (points.track_id >= 0)
     return dict(zip(points.track_id[seen].tolist(), points.positions[seen], strict=True))

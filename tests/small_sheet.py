@@ -1,0 +1,114 @@
+"""A small sheet that several tests share, so that JAX compiles its shapes once, and lifts of it by the estimator's engine."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jiggle_mj.estimator.block_tridiagonal import BlockTridiagonal, Layout
+from jiggle_mj.estimator.energy import SheetEnergy
+from jiggle_mj.estimator.environment import Grip
+from jiggle_mj.estimator.equilibrium import equilibrium
+from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.surrogate import surrogate
+
+from jiggle_mj.observation import Declaration
+
+SPACING = 7e-3
+DECLARATION = Declaration()
+STIFFNESS = 1.0
+"""Of each attached particle [N/m], a thirtieth of the membrane's."""
+GRIP_RADIUS = 8e-3
+FORCE_TOLERANCE = 1e-8
+"""[N]; the weight of one particle is 4e-4."""
+
+search = eqx.filter_jit(equilibrium)
+
+
+def equilateral(columns: int, rows: int, spacing: float = SPACING) -> SheetMesh:
+    """Equilateral triangles only: offset rows with a zigzag outline."""
+    place = [(i + 0.5 * (j % 2), j * np.sqrt(0.75), 0.0) for j in range(rows) for i in range(columns)]
+    faces = []
+    for j in range(rows - 1):
+        for i in range(columns - 1):
+            a, b, c, d = j * columns + i, j * columns + i + 1, (j + 1) * columns + i, (j + 1) * columns + i + 1
+            faces += [(a, b, d), (a, d, c)] if j % 2 else [(a, b, c), (b, d, c)]
+    rest = spacing * np.array(place)
+    return SheetMesh(rest - rest.mean(axis=0), np.array(faces))
+
+
+def jittered(mesh: SheetMesh, share: float, seed: int = 0) -> SheetMesh:
+    """The same triangles with every particle moved in the plane by up to `share` of the spacing."""
+    move = np.random.default_rng(seed).uniform(-share, share, (mesh.n, 2)) * mesh.spacing
+    return SheetMesh(mesh.rest + np.column_stack([move, np.zeros(mesh.n)]), mesh.faces)
+
+
+def dense(layout: Layout, matrix: BlockTridiagonal) -> np.ndarray:
+    """The 3n x 3n matrix in particle order."""
+    nb, m = matrix.diagonal.shape[:2]
+    whole = np.zeros((nb * m, nb * m))
+    for k in range(nb):
+        whole[k * m : (k + 1) * m, k * m : (k + 1) * m] = matrix.diagonal[k]
+    for k in range(nb - 1):
+        whole[(k + 1) * m : (k + 2) * m, k * m : (k + 1) * m] = matrix.lower[k]
+        whole[k * m : (k + 1) * m, (k + 1) * m : (k + 2) * m] = np.asarray(matrix.lower[k]).T
+    rows = (3 * np.asarray(layout.slot)[:, None] + np.arange(3)).ravel()
+    return whole[np.ix_(rows, rows)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lift:
+    """One frame of a lifted sheet, without noise."""
+
+    x: np.ndarray
+    tip: np.ndarray
+    held: np.ndarray
+    grasp: int
+
+
+@cache
+def sheet() -> SheetMesh:
+    """81 particles, 60 mm x 48 mm, slightly irregular."""
+    return jittered(equilateral(9, 9), 0.1)
+
+
+@cache
+def sheet_energy() -> SheetEnergy:
+    """Membrane, bending, weight and bed."""
+    return surrogate(sheet(), DECLARATION)
+
+
+def gripped(energy: SheetEnergy, x: np.ndarray, corner: np.ndarray, tip: np.ndarray) -> SheetEnergy:
+    """The energy with jaws that closed at a corner around particles at x, the tip moved since."""
+    grip = Grip.build(jnp.asarray(x), jnp.asarray(corner), radius=GRIP_RADIUS, stiffness=100.0)
+    grip = eqx.tree_at(lambda g: g.tip, grip, jnp.asarray(tip))
+    return SheetEnergy.build(np.asarray(energy.rest), (*energy.terms, grip), energy.layout)
+
+
+def attached() -> np.ndarray:
+    """A disc in the middle."""
+    return np.linalg.norm(sheet().rest, axis=1) < 11e-3
+
+
+def corners() -> list[np.ndarray]:
+    """Where the jaws close [m]."""
+    flat = sheet().rest[:, :2]
+    return [sheet().rest[np.argmax(flat @ np.array(way))] + 1e-3 for way in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+
+
+@cache
+def lifts(stiffness: float = STIFFNESS) -> tuple[Lift, ...]:
+    """Three frames of each of four corner lifts, the attached particles on springs of the given stiffness."""
+    energy, b = sheet_energy(), jnp.asarray(stiffness * attached())
+    frames = []
+    for grasp, corner in enumerate(corners(), start=1):
+        x = sheet().rest
+        held = np.linalg.norm(x - corner, axis=1) <= GRIP_RADIUS
+        for height in (0.0, 6e-3, 12e-3, 18e-3):
+            tip = corner + np.array([0.0, 0.0, height]) - 0.3 * height * corner / np.linalg.norm(corner)
+            found = search(gripped(energy, sheet().rest, corner, tip), b, jnp.asarray(x))
+            assert found.converged, (grasp, height, found.force)
+            x = np.asarray(found.x)
+            frames.append(Lift(x=x, tip=tip, held=held, grasp=grasp))
+    return tuple(frames)
