@@ -84,4 +84,4 @@ class SheetEnergy(eqx.Module):
             for term, place in zip(self.terms, self.places, strict=True)
         ]
         matrix = assemble(self.layout, elements)
-        return add_to_diagonal(self.layout, matrix, b[:, None, None] * jnp.eye(3, dtype=x.dtype))
+        return add_to_diagonal(self.layout, matrix, b[:, None, None] * jnp.eye(3, dtype=x.dtype)[None])

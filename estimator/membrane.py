@@ -47,12 +47,12 @@ class TriangleMembrane(Term):
         )
 
     def _stress(self, strain: Float[Array, "f 2 2"]) -> Float[Array, "f 2 2"]:
-        trace = jnp.trace(strain, axis1=1, axis2=2)[:, None, None] * jnp.eye(2, dtype=strain.dtype)
+        trace = jnp.trace(strain, axis1=1, axis2=2)[:, None, None] * jnp.eye(2, dtype=strain.dtype)[None]
         return self.stiffness / (1 - self.poisson**2) * ((1 - self.poisson) * strain + self.poisson * trace)
 
     def _deformation(self, x: Float[Array, "f 3 3"]) -> tuple[Float[Array, "f 3 2"], Float[Array, "f 2 2"]]:
         F = jnp.einsum("fai,fak->fik", x, self.shape_gradient)
-        return F, 0.5 * (F.swapaxes(1, 2) @ F - jnp.eye(2, dtype=x.dtype))
+        return F, 0.5 * (F.swapaxes(1, 2) @ F - jnp.eye(2, dtype=x.dtype)[None])
 
     def energy(self, x: Float[Array, "f 3 3"]) -> Float[Array, " f"]:
         """A/2 S:E [J]."""
@@ -127,7 +127,7 @@ class EdgeMembrane(Term):
         along = jnp.einsum("ei,ej->eij", d, d) / length[:, None, None] ** 2
         across = 1 - self.length / length
         across = across if compressive else jnp.maximum(across, 0)
-        window = along + across[:, None, None] * (jnp.eye(3, dtype=x.dtype) - along)
+        window = along + across[:, None, None] * (jnp.eye(3, dtype=x.dtype)[None] - along)
         sign = jnp.array([[1.0, -1.0], [-1.0, 1.0]], dtype=x.dtype)
         return jnp.einsum("e,ab,eij->eaibj", self.stiffness, sign, window)
 
@@ -135,8 +135,8 @@ class EdgeMembrane(Term):
 def _tensile(stress: Float[Array, "f 2 2"]) -> Float[Array, "f 2 2"]:
     """Symmetric 2x2 matrices with negative eigenvalues set to zero, in closed form."""
     mean = 0.5 * (stress[:, 0, 0] + stress[:, 1, 1])
-    deviator = stress - mean[:, None, None] * jnp.eye(2, dtype=stress.dtype)
+    deviator = stress - mean[:, None, None] * jnp.eye(2, dtype=stress.dtype)[None]
     radius = jnp.sqrt(0.5 * jnp.sum(deviator**2, axis=(1, 2)) + jnp.finfo(stress.dtype).tiny)
     high, low = jnp.maximum(mean + radius, 0), jnp.maximum(mean - radius, 0)
     slope = (high - low) / (2 * radius)
-    return 0.5 * (high + low)[:, None, None] * jnp.eye(2, dtype=stress.dtype) + slope[:, None, None] * deviator
+    return 0.5 * (high + low)[:, None, None] * jnp.eye(2, dtype=stress.dtype)[None] + slope[:, None, None] * deviator

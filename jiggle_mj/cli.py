@@ -156,6 +156,22 @@ def score(directory: PathArgument, /, *, truth: Path, as_json: AsJson = False) -
     _show(score_directory(directory, truth), directory, as_json)
 
 
+def table(
+    name: Annotated[Literal["main"], tyro.conf.Positional], /, *, out: Out, seeds: tuple[int, ...] = (0, 1, 2)
+) -> None:
+    """Run a table of scenes and seeds, and print it as Markdown; what is in OUT already is not run again.
+
+    Args:
+        name: main is the README's.
+        out: holds a folder for each run.
+        seeds: of each row.
+    """
+    from jiggle_mj.eval.tables import MAIN, markdown, measure
+
+    rows = {"main": MAIN}[name]
+    print(markdown(measure(rows, seeds, out, say=lambda text: console.print(text, highlight=False))))
+
+
 def doctor(*, as_json: AsJson = False) -> None:
     """Check this machine: versions, JAX devices, offscreen OpenGL, cores and memory.
 
@@ -175,7 +191,15 @@ def doctor(*, as_json: AsJson = False) -> None:
         sys.exit(1)
 
 
-VERBS = {"run": run, "record": record, "import": import_, "estimate": estimate, "score": score, "doctor": doctor}
+VERBS = {
+    "run": run,
+    "record": record,
+    "import": import_,
+    "estimate": estimate,
+    "score": score,
+    "table": table,
+    "doctor": doctor,
+}
 
 
 def main() -> None:

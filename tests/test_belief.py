@@ -12,7 +12,11 @@ ROUNDING = 1e-9
 """Relative; matrices here have condition numbers below 1e5."""
 N = 12
 
-minimum = jax.jit(non_negative_minimum)
+_minimum = jax.jit(non_negative_minimum)
+
+
+def minimum(A: jax.Array, c: jax.Array) -> jax.Array:
+    return _minimum(A, c, c > 0)
 
 
 def positive_definite(seed: int, n: int = N, scale: float = 1.0) -> np.ndarray:

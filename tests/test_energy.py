@@ -78,8 +78,9 @@ def derivatives():
             whole = jax.jacfwd(jax.grad(total))(y)
             return whole[jnp.arange(m), :, :, jnp.arange(m)]
 
-        functions = (term.energy, jax.grad(total), curvature, term.gradient, term.hessian, term.positive_hessian)
-        return tuple(jax.jit(f) for f in functions)
+        names = ("energy", "gradient", "hessian", "positive_hessian")
+        energy, *rest = (jax.jit(lambda y, name=name: getattr(term, name)(y)) for name in names)
+        return energy, jax.jit(jax.grad(total)), jax.jit(curvature), *rest
 
     return {name: (term, *compiled(term)) for name, term in terms().items()}
 

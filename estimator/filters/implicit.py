@@ -189,14 +189,14 @@ class ImplicitFilter(eqx.Module):
             windows = jnp.swapaxes(term.hessian(x[term.vertices]), 2, 3).reshape(-1, 3, 3)
             rows = rows.at[slot.reshape(-1)].add(windows)
         itself = self.neighbours == jnp.arange(n)[:, None]
-        boundary = jnp.where(itself[:, :, None, None], (b[:, None, None] * jnp.eye(3))[:, None], 0.0)
+        boundary = jnp.where(itself[:, :, None, None], (b[:, None, None] * jnp.eye(3)[None])[:, None], 0.0)
         return rows.reshape(n, width, 3, 3) + boundary
 
     def _linearise(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> "_Frame":
         rows, weight = self._rows(x, b), self._force_weight(evidence)
         squares = jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows)
         matrix = assemble(self.layout, [(self.places, squares)])
-        matrix = add_to_diagonal(self.layout, matrix, evidence.precision + FAINT * jnp.eye(3))
+        matrix = add_to_diagonal(self.layout, matrix, evidence.precision + FAINT * jnp.eye(3)[None])
         return _Frame(
             x=x,
             d=x - self.energy.rest,

@@ -1,0 +1,103 @@
+"""Tables of many runs: each scene, sensing and seed in a folder of its own, then means and spreads as Markdown.
+
+A table that was interrupted goes on where it was: a folder with a scored result is not run again.
+"""
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jiggle_mj.eval.experiment import run_scene
+from jiggle_mj.eval.score import Json
+from jiggle_mj.scenes import load_scene
+from jiggle_mj.scenes.reference import Sensing
+
+from jiggle_mj.episode import RESULT
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One line of a table: the same scene and sensing over all seeds."""
+
+    scene: str
+    sensing: Sensing
+
+
+MAIN = (
+    *(Row(scene=scene, sensing="stereo") for scene in ("arc", "line", "u_shape", "free")),
+    *(Row(scene=scene, sensing="particles") for scene in ("arc", "line", "u_shape", "line_dot", "arc_line", "free")),
+)
+"""The README's table."""
+FIGURES = (
+    ("attached", ("detection", "n_attached"), 1.0, 0),
+    ("reported", ("detection", "n_detected"), 1.0, 0),
+    ("PCD % exact", ("detection", "by_dilation", "0", "pcd"), 100.0, 1),
+    ("PUG % exact", ("detection", "by_dilation", "0", "pug"), 100.0, 1),
+    ("PCD % one ring", ("detection", "by_dilation", "1", "pcd"), 100.0, 1),
+    ("PUG % one ring", ("detection", "by_dilation", "1", "pug"), 100.0, 1),
+    ("NEES/dof", ("calibration", "nees_per_dof"), 1.0, 2),
+    ("tracking mm", ("tracking", "rms_m"), 1e3, 2),
+    ("update s", ("timing", "update_s", "median"), 1.0, 2),
+    ("perception s", ("timing", "perception_s"), 1.0, 2),
+)
+"""Heading, place in result.json, factor and digits of each column."""
+
+
+def measure(
+    rows: Iterable[Row], seeds: Iterable[int], directory: Path, *, say: Callable[[str], None]
+) -> dict[Row, list[Json]]:
+    """Run what has not been run, and read all results.
+
+    Args:
+        rows: of the table.
+        seeds: of each row.
+        directory: holds a folder for each run.
+        say: told of each run before it starts.
+    """
+    seeds, found = tuple(seeds), {}
+    for row in rows:
+        found[row] = []
+        for seed in seeds:
+            folder = directory / f"{row.scene}-{row.sensing}-{seed}"
+            done = _scored(folder / RESULT)
+            if done is None:
+                say(f"{row.scene}, {row.sensing}, seed {seed}")
+                done = run_scene(load_scene(row.scene), folder, seed=seed, sensing=row.sensing, overwrite=True)
+            found[row].append(done)
+    return found
+
+
+def markdown(results: dict[Row, list[Json]]) -> str:
+    """Mean over the seeds, and the range behind it where they differ."""
+    lines = [
+        "| scene | sensing | " + " | ".join(name for name, *_ in FIGURES) + " |",
+        "|" + "---|" * (len(FIGURES) + 2),
+    ]
+    for row, runs in results.items():
+        cells = [_cell([_value(run, path) for run in runs], factor, digits) for _, path, factor, digits in FIGURES]
+        lines.append(f"| {row.scene} | {row.sensing} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _scored(path: Path) -> Json | None:
+    if not path.exists():
+        return None
+    figures = json.loads(path.read_text())
+    return figures if figures["detection"]["n_attached"] is not None else None
+
+
+def _value(run: Json, path: tuple[str, ...]) -> float | None:
+    value: object = run
+    for key in path:
+        value = value[key] if isinstance(value, dict) else None
+    return None if value is None else float(str(value))
+
+
+def _cell(values: list[float | None], factor: float, digits: int) -> str:
+    known = factor * np.array([value for value in values if value is not None])
+    if not len(known):
+        return "–"  # noqa: RUF001  # a dash of its own for 'not defined'
+    mean, low, high = (f"{number:.{digits}f}" for number in (known.mean(), known.min(), known.max()))
+    return mean if low == high else f"{mean} ({low}…{high})"
