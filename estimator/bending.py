@@ -20,6 +20,8 @@ class IsometricBending(Term):
     """Cotangent weights times the square root of the hinge's stiffness [(N/m)^(1/2)]."""
     curvature: Float[Array, " h"]
     """c, the weighted sum along the normal at rest [J^(1/2)]."""
+    facing: Float[Array, "h 2"]
+    """Weight of each triangle in the hinge's normal, so that both count alike at rest [1/m^2]."""
 
     @classmethod
     def build(cls, mesh: SheetMesh, *, stiffness: float) -> "IsometricBending":
@@ -32,12 +34,19 @@ class IsometricBending(Term):
         first, second = np.cross(x1 - x0, x2 - x0), np.cross(x1 - x0, x3 - x0)
         area = 0.5 * (np.linalg.norm(first, axis=1) + np.linalg.norm(second, axis=1))
         weight = cotangent * np.sqrt(stiffness / area)[:, None]
-        curvature = np.sum(np.einsum("ha,hai->hi", weight, rest) * np.asarray(_normal(jnp.asarray(rest))), axis=1)
-        return cls(vertices=mesh.hinges, weight=jnp.asarray(weight), curvature=jnp.asarray(curvature))
+        facing = 0.5 / np.stack([np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)], axis=1)
+        normal = np.asarray(_normal(jnp.asarray(rest), jnp.asarray(facing)))
+        curvature = np.sum(np.einsum("ha,hai->hi", weight, rest) * normal, axis=1)
+        return cls(
+            vertices=mesh.hinges,
+            weight=jnp.asarray(weight),
+            curvature=jnp.asarray(curvature),
+            facing=jnp.asarray(facing),
+        )
 
     def energy(self, x: Float[Array, "h 4 3"]) -> Float[Array, " h"]:
         """[J]."""
-        bent = jnp.einsum("ha,hai->hi", self.weight, x) - self.curvature[:, None] * _normal(x)
+        bent = jnp.einsum("ha,hai->hi", self.weight, x) - self.curvature[:, None] * _normal(x, self.facing)
         return 0.5 * jnp.sum(bent**2, axis=1)
 
     def positive_hessian(self, x: Float[Array, "h 4 3"]) -> Float[Array, "h 4 3 4 3"]:
@@ -45,10 +54,11 @@ class IsometricBending(Term):
         return jnp.einsum("ha,hb,ij->haibj", self.weight, self.weight, jnp.eye(3, dtype=x.dtype))
 
 
-def _normal(x: Float[Array, "h 4 3"]) -> Float[Array, "h 3"]:
-    """Unit mean normal of a hinge's two triangles."""
+def _normal(x: Float[Array, "h 4 3"], facing: Float[Array, "h 2"]) -> Float[Array, "h 3"]:
+    """Unit mean normal of a hinge's two triangles; with equal weights, the direction in which a bent hinge pulls."""
     edge = x[:, 1] - x[:, 0]
-    normal = jnp.cross(edge, x[:, 2] - x[:, 0]) - jnp.cross(edge, x[:, 3] - x[:, 0])
+    first, second = jnp.cross(edge, x[:, 2] - x[:, 0]), jnp.cross(edge, x[:, 3] - x[:, 0])
+    normal = facing[:, :1] * first - facing[:, 1:] * second
     return normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
 
 

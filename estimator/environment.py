@@ -117,11 +117,19 @@ class Grip(Term):
         """[J]."""
         return 0.5 * self.stiffness * (self._stretch(x)[1] - self.length) ** 2
 
+    def hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
+        """Along the spring k_a, across it k_a (1 - r/|d|) [N/m]."""
+        return self._window(x, compressive=True)
+
     def positive_hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
         """Along the spring k_a, across it k_a (1 - r/|d|) where that is positive [N/m]."""
+        return self._window(x, compressive=False)
+
+    def _window(self, x: Float[Array, "n 1 3"], *, compressive: bool) -> Float[Array, "n 1 3 1 3"]:
         d, distance = self._stretch(x)
         along = jnp.einsum("ni,nj->nij", d, d) / distance[:, None, None] ** 2
-        across = jnp.maximum(1 - self.length / distance, 0)[:, None, None]
+        across = jnp.where(self.length > 0, 1 - self.length / distance, 1.0)
+        across = (across if compressive else jnp.maximum(across, 0))[:, None, None]
         window = along + across * (jnp.eye(3, dtype=x.dtype)[None] - along)
         return (self.stiffness[:, None, None] * window)[:, None, :, None, :]
 

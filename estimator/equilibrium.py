@@ -46,12 +46,13 @@ def _search(dynamic, static, b, start, force_tolerance, max_steps):
     """The implicitly differentiated search; see `equilibrium`."""
 
     @jax.custom_jvp
-    def solution(dynamic, b):
+    def solution(dynamic, b, start):
         return _minimise(eqx.combine(dynamic, static), b, start, force_tolerance, max_steps)
 
     @solution.defjvp
     def tangent(primals, tangents):
         out = solution(*primals)
+        primals, tangents = primals[:2], tangents[:2]
         x = out[0]
         _, change = jax.jvp(lambda d, b: eqx.combine(d, static).gradient(x, b), primals, tangents)
         energy = eqx.combine(primals[0], static)
@@ -59,7 +60,7 @@ def _search(dynamic, static, b, start, force_tolerance, max_steps):
         dx = _implicit_solve(energy, matrix, -change)
         return out, (dx, jnp.zeros_like(out[1]), jnp.zeros(out[2].shape, jax.dtypes.float0))
 
-    return solution(dynamic, b)
+    return solution(dynamic, b, start)
 
 
 def _implicit_solve(energy, matrix, rhs):

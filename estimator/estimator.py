@@ -35,7 +35,7 @@ class EstimatorConfig:
     """Between the particles of a mesh laid over images [m]."""
     membrane: Membrane = "triangles"
     """Law of the sheet's plane: St Venant-Kirchhoff triangles, or the paper's springs along the edges."""
-    prior_sd: float = 1 / 60
+    prior_sd: float = 1 / 75
     """Standard deviation of each attachment stiffness before anything is seen [k]."""
     force_sd: float = 4.5e-3
     """Standard deviation of the force that the model gets wrong on a particle [k x spacing]."""
@@ -43,7 +43,7 @@ class EstimatorConfig:
     """How well held particles follow the tip [m]."""
     grip_stiffness: float = 3.0
     """Of the springs that carry held particles with the tip while the state is searched [k]."""
-    detect_above: float = 0.01
+    detect_above: float = 0.0125
     """A particle is reported attached when its mean stiffness exceeds this [k]."""
 
     def __post_init__(self) -> None:

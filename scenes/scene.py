@@ -64,7 +64,7 @@ class Programme(Section):
     """Grasps and lifts, one point after the other."""
 
     section: ClassVar[str] = "programme"
-    still_frames: int = integer(5, at_least=1, at_most=1000)
+    still_frames: int = integer(20, at_least=1, at_most=1000)
     """Frames before the first grasp, from which noise can be learned."""
     points: tuple[tuple[float, float], ...] = points((), at_least=0)
     """Where to grasp, tissue coordinates [m]; empty means the four corners."""

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jiggle_mj.estimator.equilibrium import equilibrium
 from jiggle_mj.estimator.surrogate import surrogate
 from scipy.optimize import minimize
 from small_sheet import (
@@ -23,8 +24,8 @@ from small_sheet import (
     sheet_energy,
 )
 
-SAME_PLACE = 2e-8
-"""[m]: a force tolerance of 1e-8 N over the softest stiffness, about 1 N/m, with room."""
+SAME_PLACE = 3e-7
+"""[m]: a force tolerance of 1e-8 N over the stiffness of bending, 3e-6 N m / (7 mm)^2 = 0.06 N/m, twice."""
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +104,7 @@ def test_scaling_every_stiffness_and_weight_moves_nothing(lifted):
 def place(energy, b, tip, start):
     """Equilibrium as a function of b and the tip."""
     energy = eqx.tree_at(lambda e: e.terms[-1].tip, energy, tip)
-    return search(energy, b, start, force_tolerance=1e-11).x
+    return equilibrium(energy, b, start, force_tolerance=1e-11).x
 
 
 def test_implicit_derivatives_in_b_and_tip_equal_finite_differences_forward_and_reverse(lifted):
@@ -114,10 +115,10 @@ def test_implicit_derivatives_in_b_and_tip_equal_finite_differences_forward_and_
     tip = energy.terms[-1].tip
     move_b, move_tip = jnp.asarray(draw.normal(size=len(b))), jnp.asarray(draw.normal(size=3) * 1e-3)
     out = jnp.asarray(draw.normal(size=found.x.shape))
-    start = place(energy, b, tip, found.x)
+    start = search(energy, b, found.x, force_tolerance=1e-11).x
 
-    f = lambda b, tip: place(energy, b, tip, start)  # noqa: E731
-    _, forward = jax.jit(lambda b, tip: jax.jvp(f, (b, tip), (move_b, move_tip)))(b, tip)
+    f = jax.jit(lambda b, tip: place(energy, b, tip, start))
+    _, forward = jax.jvp(f, (b, tip), (move_b, move_tip))
     step = 1e-4
     ends = [np.asarray(f(b + s * step * move_b, tip + s * step * move_tip)) for s in (1, -1)]
     difference = (ends[0] - ends[1]) / (2 * step)
@@ -126,7 +127,7 @@ def test_implicit_derivatives_in_b_and_tip_equal_finite_differences_forward_and_
     assert scale > 1e-4
     np.testing.assert_allclose(forward, difference, atol=1e-4 * scale)
 
-    by_b, by_tip = jax.jit(jax.grad(lambda b, tip: jnp.sum(out * f(b, tip)), argnums=(0, 1)))(b, tip)
+    by_b, by_tip = jax.grad(lambda b, tip: jnp.sum(out * f(b, tip)), argnums=(0, 1))(b, tip)
     reverse = float(by_b @ move_b + by_tip @ move_tip)
     assert reverse == pytest.approx(float(jnp.sum(out * forward)), rel=1e-8)
 

@@ -1,0 +1,136 @@
+"""The implicit filter: attachments found on its own engine, the dense formula, missing particles, honest uncertainty."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.filters.implicit import FAINT, Evidence, ImplicitFilter
+from scipy.stats import chi2
+from small_sheet import DECLARATION, STIFFNESS, Lift, attached, dense, lifts, sheet, sheet_energy
+
+NOISE, GRIP_SD = 2e-4, 1.5e-3
+"""[m]."""
+K = DECLARATION.membrane_stiffness
+PRIOR_SD = 0.5
+"""[N/m]; half of the true stiffness."""
+THRESHOLD = 0.3
+"""[N/m]; k / 100, as the estimator's front has it."""
+
+update = eqx.filter_jit(ImplicitFilter.update)
+information = eqx.filter_jit(lambda f, x, b, evidence: f._information(f._linearise(x, b, evidence), b))
+
+
+@pytest.fixture(scope="module")
+def implicit() -> ImplicitFilter:
+    return ImplicitFilter.build(sheet(), sheet_energy(), force_sd=4.5e-3 * K * sheet().spacing, grip_stiffness=3 * K)
+
+
+def evidence(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:
+    """Noisy positions, and held particles as the tip says."""
+    noisy = frame.x + NOISE * np.random.default_rng(seed).normal(size=frame.x.shape)
+    sd = np.where(frame.held, GRIP_SD, NOISE)
+    precision = np.eye(3) / sd[:, None, None] ** 2
+    if unseen is not None:
+        precision = np.where(unseen[:, None, None], 0.0, precision)
+    return Evidence(y=jnp.asarray(noisy), precision=jnp.asarray(precision), held=jnp.asarray(frame.held))
+
+
+def run(implicit: ImplicitFilter, frames: tuple[Lift, ...], seed: int):
+    belief, b = BoundaryBelief.prior(sheet().n, mean=0.0, sd=PRIOR_SD), jnp.zeros(sheet().n)
+    for k, frame in enumerate(frames):
+        seen = evidence(frame, 100 * seed + k)
+        out = update(implicit, belief, b, seen, seen.y)
+        belief, b = out.belief, out.b
+    return out
+
+
+@pytest.fixture(scope="module")
+def runs(implicit):
+    return [run(implicit, lifts(), seed) for seed in range(8)]
+
+
+def test_the_attached_particles_are_found_and_no_others(runs):
+    """Four corner lifts with 0.2 mm of noise, on the filter's own engine; at most one particle in 81 is wrong a run."""
+    wrong = [int(np.sum((np.asarray(out.b) > THRESHOLD) != attached())) for out in runs]
+    assert max(wrong) <= 1, wrong
+
+
+def test_a_free_sheet_has_no_attachment(implicit):
+    for seed in range(2):
+        assert not (np.asarray(run(implicit, lifts(0.0), seed).b) > THRESHOLD).any()
+
+
+def test_errors_are_as_large_as_stated(runs):
+    """NEES per degree of freedom over eight seeds; the issue asks for 0.5 to 2. Its chi-square band would be 0.89-1.11,
+    but truth here is no draw from the prior."""
+    truth = STIFFNESS * attached()
+    nees = []
+    for out in runs:
+        mean, covariance = (np.asarray(part) for part in out.belief.moments())
+        nees.append((mean - truth) @ np.linalg.solve(covariance, mean - truth) / len(truth))
+    low, high = chi2.ppf([0.005, 0.995], len(truth) * len(runs)) / (len(truth) * len(runs))
+    assert 0.5 * low < np.mean(nees) < 2 * high, nees
+
+
+def test_the_state_is_closer_to_the_truth_than_what_was_seen(implicit):
+    """The sheet's physics filters the noise."""
+    frame = lifts()[3]
+    seen = evidence(frame, 5)
+    belief = BoundaryBelief.prior(sheet().n, mean=STIFFNESS / 2, sd=PRIOR_SD)
+    out = update(implicit, belief, jnp.asarray(STIFFNESS * attached()), seen, seen.y)
+    free = ~frame.held
+    rms = [np.sqrt(np.mean((np.asarray(x) - frame.x)[free] ** 2)) for x in (out.x, seen.y)]
+    assert rms[0] < 0.8 * rms[1]
+
+
+def test_information_equals_the_dense_formula(implicit):
+    """D^T (tau^2 I + H R H)^-1 D over particles that are not held, and the shift D^T N^-1 (D b - g - H (y - x))."""
+    frame = lifts()[3]
+    seen = evidence(frame, 1)
+    b = jnp.asarray(np.random.default_rng(0).uniform(0, 1, sheet().n))
+    gained, shift = information(implicit, jnp.asarray(frame.x), b, seen)
+
+    n, free = sheet().n, np.repeat(~frame.held, 3)
+    H = dense(sheet_energy().layout, sheet_energy().hessian(jnp.asarray(frame.x), b))
+    R = np.zeros((3 * n, 3 * n))
+    for i in range(n):
+        R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = np.linalg.inv(np.asarray(seen.precision)[i] + FAINT * np.eye(3))
+    N = float(implicit.force_sd) ** 2 * np.eye(3 * n) + H @ R @ H
+    D = np.zeros((3 * n, n))
+    for i in range(n):
+        D[3 * i : 3 * i + 3, i] = frame.x[i] - sheet().rest[i]
+    D, N = D[free], N[np.ix_(free, free)]
+    expected = D.T @ np.linalg.solve(N, D)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(gained, expected, atol=1e-7 * scale)
+
+    g = np.asarray(sheet_energy().gradient(jnp.asarray(frame.x), b)).ravel()
+    residual = (g + H @ (np.asarray(seen.y) - frame.x).ravel())[free]
+    expected_shift = expected @ np.asarray(b) - D.T @ np.linalg.solve(N, residual)
+    np.testing.assert_allclose(shift, expected_shift, atol=1e-6 * np.abs(expected_shift).max())
+
+
+def test_a_missing_particle_has_no_influence(implicit):
+    """Whatever stands in y where the precision is zero, the outcome is the same."""
+    frame = lifts()[3]
+    unseen = np.zeros(sheet().n, bool)
+    unseen[[3, 20, 44, 60]] = True
+    seen = evidence(frame, 2, unseen)
+    other = Evidence(
+        y=jnp.where(jnp.asarray(unseen)[:, None], seen.y + 0.3, seen.y), precision=seen.precision, held=seen.held
+    )
+    belief, b = BoundaryBelief.prior(sheet().n, mean=0.0, sd=PRIOR_SD), jnp.zeros(sheet().n)
+    one, two = (update(implicit, belief, b, e, jnp.asarray(frame.x)) for e in (seen, other))
+    for name in ("x", "b", "nis"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    np.testing.assert_array_equal(one.belief.precision, two.belief.precision)
+
+
+def test_evidence_only_sharpens(implicit):
+    """Each frame's information is positive semi-definite, so the entropy falls."""
+    frame = lifts()[3]
+    gained, _ = information(implicit, jnp.asarray(frame.x), jnp.zeros(sheet().n), evidence(frame, 3))
+    values = np.linalg.eigvalsh(np.asarray(gained))
+    assert values.min() > -1e-9 * values.max()
+    assert values.max() > PRIOR_SD**-2
