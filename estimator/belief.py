@@ -24,7 +24,7 @@ class BoundaryBelief(eqx.Module):
     @classmethod
     def prior(cls, n: int, *, mean: float, sd: float) -> "BoundaryBelief":
         """Independent particles [N/m]."""
-        return cls(precision=jnp.eye(n) / sd**2, shift=jnp.full(n, mean / sd**2))
+        return cls(precision=jnp.eye(n) / sd**2, shift=jnp.full(n, mean / sd**2, dtype=float))
 
     def add(self, precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> "BoundaryBelief":
         """The belief after independent evidence in information form."""

@@ -87,7 +87,9 @@ class BlockCholesky(eqx.Module):
     """Block (k + 1, k)."""
 
 
-def assemble(layout: Layout, elements: list[tuple[Int[Array, "_m _p _p"], Float[Array, "_m _p 3 _p 3"]]]) -> BlockTridiagonal:
+def assemble(
+    layout: Layout, elements: list[tuple[Int[Array, "_m _p _p"], Float[Array, "_m _p 3 _p 3"]]]
+) -> BlockTridiagonal:
     """Sum element matrices, each given with its `Layout.pair_index`; padding gets an identity."""
     nb, w = layout.n_blocks, layout.width
     index = jnp.concatenate([i.reshape(-1) for i, _ in elements])

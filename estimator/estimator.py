@@ -95,22 +95,32 @@ class Estimator:
         """The particles; fixed from the first grasp on.
 
         Raises:
-            ValueError: asked before that.
+            ValueError: asked before the first frame with closed jaws.
         """
-        if self._sheet is None or self._filter is None:
-            raise ValueError("the sheet is not known before the first frame with closed jaws; call update first.")
+        self._check_begun()
+        assert self._sheet is not None
         return self._sheet
 
     @property
     def belief(self) -> Belief:
-        """The Gaussian belief so far."""
+        """The Gaussian belief so far.
+
+        Raises:
+            ValueError: asked before the first frame with closed jaws.
+        """
+        self._check_begun()
         with jax.enable_x64(True):
             mean, covariance = self._belief.moments()
             return Belief(mean=np.asarray(mean), covariance=np.asarray(covariance))
 
     @property
     def detection(self) -> Detection:
-        """Which particles are called attached so far."""
+        """Which particles are called attached so far.
+
+        Raises:
+            ValueError: asked before the first frame with closed jaws.
+        """
+        self._check_begun()
         limit = self.config.detect_above * self.declaration.membrane_stiffness
         return Detection(
             attached=self._b > limit,
@@ -166,6 +176,10 @@ class Estimator:
             update_s=time.perf_counter() - seen,
             perception_s=seen - began,
         )
+
+    def _check_begun(self) -> None:
+        if self._filter is None:
+            raise ValueError("the sheet is not known before the first frame with closed jaws; call update first.")
 
     def _look_at_rest(self, observation: Observation) -> None:
         """Use a frame before the first grasp: the first image, every cloud of points."""

@@ -53,7 +53,7 @@ def run_scene(
     Args:
         scene: the tissue and the grasp programme.
         directory: where the files go.
-        seed: of noise and texture; the same seed gives the same recording.
+        seed: of the sensing noise; the same seed gives the same recording.
         sensing: what the estimator sees.
         config: of the estimator.
         overwrite: replace an earlier run's files.

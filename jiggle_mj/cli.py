@@ -49,7 +49,7 @@ def run(
         scene: a shipped scene (arc, line, ...) or the path of a scene file.
         out: folder for run.mcap, run.truth.mcap, estimate.mcap, result.json and report.html.
         sensing: what the estimator sees: images; noisy tracked points of the tissue; noisy vertices of the reference.
-        seed: of noise and texture.
+        seed: of the sensing noise.
         overwrite: replace results that are already in the folder.
         as_json: print result.json to stdout.
     """
@@ -69,7 +69,7 @@ def record(scene: Name, /, *, out: Out, sensing: Sensing = "stereo", seed: int =
         scene: a shipped scene or the path of a scene file.
         out: the recording, for example run.mcap; the truth goes to run.truth.mcap.
         sensing: what is recorded.
-        seed: of noise and texture.
+        seed: of the sensing noise.
         overwrite: replace files that are already there.
     """
     from jiggle_mj.episode import observe

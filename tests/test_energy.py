@@ -99,8 +99,8 @@ def test_gradient_and_hessian_are_the_energys_own_derivatives(derivatives, name,
             move = jnp.zeros(x.shape).at[:, a, i].set(step)
             forces[:, a, i] = (energy(x + move) - energy(x - move)) / (2 * step)
             stiffnesses[:, :, :, a, i] = (gradient(x + move) - gradient(x - move)) / (2 * step)
-    # Energies of up to 1e-3 J carry 1e-19 J of rounding, 1e-13 N after division.
-    assert np.max(np.abs(forces - gradient(x))) < 1e-9 + DIFFERENCE * float(jnp.max(jnp.abs(gradient(x))))
+    # Where forces vanish: the truncation h^2 / 6 times a third derivative of 100 N/m over 1.4 mm, 1.2e-8 N.
+    assert np.max(np.abs(forces - gradient(x))) < 2e-8 + DIFFERENCE * float(jnp.max(jnp.abs(gradient(x))))
     assert error(stiffnesses, hessian(x)) < DIFFERENCE
 
 
@@ -125,9 +125,7 @@ def test_positive_hessian_is_the_hessian_where_nothing_is_compressed(derivatives
 @pytest.mark.parametrize("length", [0.0, 2e-3])
 def test_a_particle_at_the_tip_gives_finite_forces_and_a_solvable_newton_step(length):
     """At |x - u| = 0 the direction of the spring is undefined; nothing may become NaN there."""
-    grip = Grip(
-        vertices=np.array([[0]]), tip=jnp.zeros(3), length=jnp.array([length]), stiffness=jnp.array([100.0])
-    )
+    grip = Grip(vertices=np.array([[0]]), tip=jnp.zeros(3), length=jnp.array([length]), stiffness=jnp.array([100.0]))
     x = jnp.zeros((1, 1, 3))
     for found in (grip.energy(x), grip.gradient(x), grip.hessian(x), grip.positive_hessian(x)):
         assert np.isfinite(np.asarray(found)).all()

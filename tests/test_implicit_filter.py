@@ -14,8 +14,8 @@ NOISE, GRIP_SD = 2e-4, 1.5e-3
 K = DECLARATION.membrane_stiffness
 PRIOR_SD = 0.5
 """[N/m]; half of the true stiffness."""
-THRESHOLD = 0.3
-"""[N/m]; k / 100, as the estimator's front has it."""
+THRESHOLD = 0.0125 * K
+"""[N/m]; as the estimator's front has it."""
 
 update = eqx.filter_jit(ImplicitFilter.update)
 information = eqx.filter_jit(lambda f, x, b, evidence: f._information(f._linearise(x, b, evidence), b))

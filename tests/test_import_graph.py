@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+import jiggle_mj
+
 ROOT = Path(__file__).parent.parent
 FOLDERS = {"jiggle_mj": "jiggle_mj", "scenes": "jiggle_mj.scenes", "estimator": "jiggle_mj.estimator",
            "eval": "jiggle_mj.eval"}  # fmt: skip
@@ -93,7 +95,7 @@ def layer(name: str) -> str:
     beginnings = [known for known in LAYER if name == known or name.startswith((known + ".", known + "_"))]
     if beginnings:
         return LAYER[max(beginnings, key=len)]
-    return "names" if name in {"jiggle_mj", "jiggle_mj.__version__"} else "vocabulary"
+    return "names" if name == "jiggle_mj" or name.removeprefix("jiggle_mj.") in jiggle_mj.__all__ else "vocabulary"
 
 
 def broken_rules(root: Path) -> list[str]:

@@ -123,7 +123,9 @@ class ImplicitFilter(eqx.Module):
         x = self._polish(frame, b, evidence)
         observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
         degrees = observed - 3 * jnp.sum(evidence.held)
-        return Update(belief=belief, x=x, b=b, nis=2 * self._cost(x, b, evidence) / jnp.maximum(degrees, 1))
+        return Update(
+            belief=belief, x=x, b=b, nis=2 * self._cost(x, b, evidence) / jnp.maximum(degrees, 1).astype(x.dtype)
+        )
 
     def _force_weight(self, evidence: Evidence) -> Float[Array, " n"]:
         return jnp.where(evidence.held, 0.0, self.force_sd**-2)

@@ -55,6 +55,9 @@ NOISE_FACTOR = 3.1
 neighbours, and robust weights make the residuals look small. Measured with image noise of 0 to 6 grey levels."""
 TREND_FACTOR = 0.6
 """Lateral error of a particle for each pixel that it is off its neighbours' trend, measured."""
+PERSISTENCE = 1.6
+"""Variances are stated this many times larger than they are in one frame: part of an error stays from frame to frame,
+and the filter takes each frame's as new. Set by the belief's NEES on the shipped scenes."""
 LEAST_SHARE = 0.7
 """A particle is hidden when less than this share of its window, of what was seen of it at rest, is tissue now."""
 OFF_TREND = 3.0
@@ -173,7 +176,7 @@ class StereoTracker:
         lateral = LATERAL_SD**2 + (TREND_FACTOR * np.where(visible, off_trend, 0)) ** 2
         noise[:, :2, :2] = lateral[:, None, None] * np.eye(2) + NOISE_FACTOR**2 * plane.spread
         noise[:, 2, 2] = DISPARITY_SD**2 + NOISE_FACTOR**2 * depth.spread[:, 0, 0]
-        return self._measurement(uvd, visible, noise)
+        return self._measurement(uvd, visible, PERSISTENCE * noise)
 
     def _guess(
         self,

@@ -1,0 +1,152 @@
+"""The command line: exit codes, what goes to stdout, what is refused, and one whole run."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from tiny_scene import call, scene_file
+
+FILES = {"run.mcap", "run.truth.mcap", "estimate.mcap", "result.json", "report.html"}
+BY_DILATION = {rings: dict.fromkeys(("pcd", "pug", "f1")) for rings in "012"}
+KEYS = {
+    **dict.fromkeys(("scene", "seed", "sensing", "estimator", "policy", "n_particles", "n_frames")),
+    "detection": {
+        **dict.fromkeys(("rule", "n_detected", "n_attached", "n_observable", "average_precision")),
+        "by_dilation": BY_DILATION,
+        "observable": {"by_dilation": BY_DILATION},
+    },
+    "calibration": dict.fromkeys(("nees_per_dof", "coverage_90", "ece")),
+    "tracking": {"rms_m": None},
+    "safety": dict.fromkeys(("limit_j", "max_mean_boundary_energy_j", "violations")),
+    "entropy": dict.fromkeys(("prior", "final")),
+    "frames": dict.fromkeys(("used", "skipped")),
+    "timing": {
+        "update_s": dict.fromkeys(("median", "p95")),
+        **dict.fromkeys(("perception_s", "plan_s", "simulation_s")),
+    },
+}
+
+
+def keys(value: object) -> object:
+    return {name: keys(inner) for name, inner in value.items()} if isinstance(value, dict) else None
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """`run` on a tiny scene: exit code, stdout, stderr, folder."""
+    folder = tmp_path_factory.mktemp("whole")
+    monkeypatch = pytest.MonkeyPatch()
+    scene, out = scene_file(folder), folder / "out"
+    with monkeypatch.context() as patch:
+        code = call(patch, "run", scene, "--out", out, "--sensing", "particles")
+    return code, scene, out
+
+
+def test_run_fills_the_folder_with_five_files(whole):
+    code, _, out = whole
+    assert code == 0
+    assert {path.name for path in out.iterdir()} == FILES
+    assert "<html" in (out / "report.html").read_text()[:500]
+
+
+def test_result_json_has_exactly_the_stated_keys(whole):
+    _, _, out = whole
+    figures = json.loads((out / "result.json").read_text())
+    assert keys(figures) == KEYS
+    assert figures["scene"] == "tiny" and figures["sensing"] == "particles"
+    assert figures["n_frames"] == figures["frames"]["used"] + len(figures["frames"]["skipped"])
+    assert figures["detection"]["n_attached"] > 0
+
+
+def test_the_attachment_of_the_tiny_scene_is_found_within_one_ring(whole):
+    """The whole chain on MuJoCo with 0.2 mm of noise, two corners of two increments."""
+    figures = json.loads((whole[2] / "result.json").read_text())
+    one = figures["detection"]["by_dilation"]["1"]
+    assert min(one["pcd"], one["pug"]) >= 0.8
+
+
+def test_estimate_then_score_with_json_print_json_and_nothing_else(whole, tmp_path, monkeypatch, capsys):
+    _, _, made = whole
+    out = tmp_path / "again"
+    assert call(monkeypatch, "estimate", made / "run.mcap", "--out", out, "--json") == 0
+    printed = capsys.readouterr()
+    figures = json.loads(printed.out)
+    assert keys(figures) == KEYS
+    assert figures["detection"]["n_attached"] is None
+    assert "report" in printed.err
+    assert call(monkeypatch, "score", out, "--truth", made / "run.truth.mcap", "--json") == 0
+    scored = json.loads(capsys.readouterr().out)
+    reference = json.loads((made / "result.json").read_text())
+    assert scored["detection"] == reference["detection"]
+    assert np.isclose(scored["tracking"]["rms_m"], reference["tracking"]["rms_m"], rtol=1e-12)
+
+
+def test_a_folder_with_results_is_refused_with_2_and_replaced_on_demand(whole, tmp_path, monkeypatch, capsys):
+    _, scene, made = whole
+    before = (made / "result.json").read_bytes()
+    assert call(monkeypatch, "run", scene, "--out", made, "--sensing", "particles") == 2
+    assert "pass --overwrite" in capsys.readouterr().err
+    assert (made / "result.json").read_bytes() == before
+    out = tmp_path / "old"
+    out.mkdir()
+    (out / "result.json").write_text("old")
+    assert call(monkeypatch, "estimate", made / "run.mcap", "--out", out, "--overwrite") == 0
+    assert keys(json.loads((out / "result.json").read_text())) == KEYS
+
+
+def one_line(text: str) -> str:
+    lines = [line for line in text.splitlines() if line.strip()]
+    assert len(lines) == 1, text
+    return lines[0]
+
+
+def test_estimating_from_the_truth_is_refused_in_one_line(whole, tmp_path, monkeypatch, capsys):
+    code = call(monkeypatch, "estimate", whole[2] / "run.truth.mcap", "--out", tmp_path / "cheat")
+    assert code == 1
+    assert "truth" in one_line(capsys.readouterr().err)
+    assert not (tmp_path / "cheat").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (("run", "nosuchscene", "--out", "x"), 2, "nosuchscene"),
+        (("run", "nosuch.toml", "--out", "x"), 2, r"nosuch.toml"),
+        (("estimate", "nosuch.mcap", "--out", "x"), 1, "nosuch.mcap"),
+        (("score", "nosuchfolder", "--truth", "nosuch.truth.mcap"), 2, "nosuchfolder"),
+        (("import", "nosuchfolder", "--out", "x.mcap"), 1, "nosuchfolder"),
+    ],
+)
+def test_what_is_not_there_is_named_in_one_line(arguments, code, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, *arguments) == code
+    printed = capsys.readouterr()
+    assert says in one_line(printed.err)
+    assert printed.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [("nosuchverb",), ("run",), ("run", "arc", "--out", "x", "--sensing", "smell")])
+def test_bad_usage_exits_with_2(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, *arguments) == 2
+    assert capsys.readouterr().err
+
+
+def test_record_writes_observations_and_truth_apart(whole, tmp_path, monkeypatch):
+    _, scene, made = whole
+    out = tmp_path / "run.mcap"
+    assert call(monkeypatch, "record", scene, "--out", out, "--sensing", "particles") == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"run.mcap", "run.truth.mcap"}
+    # The same seed gives the same bytes, whichever verb recorded.
+    assert out.read_bytes() == (made / "run.mcap").read_bytes()
+    assert call(monkeypatch, "record", scene, "--out", out, "--sensing", "particles") == 2
+
+
+def test_the_module_can_be_run():
+    done = subprocess.run([sys.executable, "-m", "jiggle_mj", "--help"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0
+    for verb in ("run", "record", "import", "estimate", "score", "doctor"):
+        assert verb in done.stdout

@@ -1,0 +1,89 @@
+"""The loop and its files: the truth never reaches the estimate, the same seed gives the same bytes."""
+
+import pytest
+from jiggle_mj.estimator import Estimator
+from jiggle_mj.scenes import Reference, load_scene, programme
+from tiny_scene import scene_file
+
+from jiggle_mj.episode import estimate, observe, prepare_directory
+from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
+from jiggle_mj.importing import truth_path
+from jiggle_mj.observation import Wait
+from jiggle_mj.recording import Recording
+from jiggle_mj.truth_recording import read_truth
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A tiny scene on disk, with its truth beside it."""
+    folder = tmp_path_factory.mktemp("recorded")
+    scene = load_scene(str(scene_file(folder)))
+    path = folder / "run.mcap"
+    with Reference(scene, seed=0, sensing="particles") as reference:
+        seen = list(observe(reference, programme(scene), path, seed=0))
+    return path, seen
+
+
+def estimated(path, out) -> bytes:
+    opened = Recording.open(path)
+    estimate(opened, Estimator(opened.declaration, opened.camera), out)
+    return out.read_bytes()
+
+
+def test_a_scrambled_truth_leaves_the_estimate_equal_to_the_byte(recording, tmp_path):
+    path, _ = recording
+    before = estimated(path, tmp_path / "one.mcap")
+    truth = truth_path(path)
+    kept = truth.read_bytes()
+    assert read_truth(truth).attached.any()
+    try:
+        truth.write_bytes(bytes(255 - byte for byte in kept))
+        assert estimated(path, tmp_path / "two.mcap") == before
+        truth.unlink()
+        assert estimated(path, tmp_path / "three.mcap") == before
+    finally:
+        truth.write_bytes(kept)
+
+
+def test_the_recording_gives_the_same_estimate_as_the_live_tissue(recording, tmp_path):
+    """What is estimated while the tissue moves = what is estimated from the file."""
+    path, seen = recording
+    opened = Recording.open(path)
+    estimate(seen, Estimator(opened.declaration, opened.camera), tmp_path / "live.mcap")
+    assert (tmp_path / "live.mcap").read_bytes() == estimated(path, tmp_path / "file.mcap")
+
+
+def test_the_truth_file_is_no_recording(recording):
+    with pytest.raises(RecordingError, match="truth"):
+        Recording.open(truth_path(recording[0]))
+
+
+def test_every_action_is_one_frame_of_recording_and_truth(recording):
+    path, seen = recording
+    indices = [one.index for one in seen]
+    assert [one.index for one in Recording.open(path)] == indices
+    assert [frame.index for frame in read_truth(truth_path(path)).frames] == indices
+
+
+def test_frames_without_closed_jaws_cannot_be_estimated(tmp_path):
+    scene = load_scene(str(scene_file(tmp_path)))
+    with Reference(scene, seed=0, sensing="particles") as reference:
+        frames = list(observe(reference, [Wait(), Wait()], seed=0))
+        with pytest.raises(PerceptionError, match="none has closed jaws"):
+            estimate(frames, Estimator(reference.declaration))
+
+
+def test_a_folder_with_results_is_kept_unless_overwriting_is_allowed(tmp_path):
+    for name in ("run.mcap", "mine.txt"):
+        (tmp_path / name).write_text("kept")
+    with pytest.raises(OutputError, match=r"already holds run\.mcap; choose another folder or pass --overwrite"):
+        prepare_directory(tmp_path, overwrite=False)
+    assert (tmp_path / "run.mcap").read_text() == "kept"
+    prepare_directory(tmp_path, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(OutputError, match="is a file; give a folder"):
+        prepare_directory(tmp_path / "out", overwrite=True)

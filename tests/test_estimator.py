@@ -1,0 +1,168 @@
+"""The estimator's front: what it waits for, skips and refuses, and that the same input gives the same bytes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from jiggle_mj.estimator import Estimator, EstimatorConfig
+from small_sheet import DECLARATION, GRIP_RADIUS, attached, lifts, sheet
+
+from jiggle_mj.errors import PerceptionError
+from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
+
+NOISE = 2e-4
+
+
+def observe(index: int, x: np.ndarray, tip: np.ndarray, grasp: int, *, closed: bool = True) -> Observation:
+    """Noisy tracked positions of all particles."""
+    noisy = x + NOISE * np.random.default_rng(index).normal(size=x.shape)
+    return Observation(
+        index=index,
+        time=index * 100_000_000,
+        tool=ToolState(
+            position=tip, quat_wxyz=np.array([1.0, 0, 0, 0]), closed=closed, grasp=grasp, radius=GRIP_RADIUS
+        ),
+        points=MeasuredPoints(positions=noisy, track_id=np.arange(len(x)), sd=NOISE),
+    )
+
+
+def still() -> list[Observation]:
+    return [observe(i, sheet().rest, np.array([0.0, 0.0, 0.05]), 0, closed=False) for i in range(2)]
+
+
+def episode() -> list[Observation]:
+    """Two frames at rest, then the twelve lifts and four closings."""
+    return [*still(), *(observe(2 + i, lift.x, lift.tip, lift.grasp) for i, lift in enumerate(lifts()))]
+
+
+def with_points(observation: Observation, **changes) -> Observation:
+    return dataclasses.replace(observation, points=dataclasses.replace(observation.points, **changes))
+
+
+@pytest.fixture(scope="module")
+def run():
+    """The whole episode, once."""
+    estimator = Estimator(DECLARATION)
+    return estimator, [estimator.update(one) for one in episode()]
+
+
+def test_attachments_are_found_from_tracked_points(run):
+    """The estimator triangulates the points anew, in the points' order; one particle in 81 may be wrong."""
+    estimator, _ = run
+    assert np.sum(estimator.detection.attached != attached()) <= 1
+
+
+def test_frames_before_the_first_grasp_give_no_estimate_and_those_with_closed_jaws_do(run):
+    _, estimates = run
+    assert estimates[:2] == [None, None]
+    assert [one.index for one in estimates[2:]] == list(range(2, 18))
+
+
+def test_the_belief_sharpens_and_starts_from_the_prior(run):
+    estimator, estimates = run
+    entropies = [estimator.prior_entropy, *(one.entropy for one in estimates[2:])]
+    assert (np.diff(entropies) < 0).all()
+    assert estimator.belief.covariance.shape == (sheet().n, sheet().n)
+
+
+def test_open_jaws_between_grasps_give_no_estimate(run):
+    estimator = Estimator(DECLARATION)
+    frames = episode()
+    for one in frames[:3]:
+        estimator.update(one)
+    assert estimator.update(observe(3, sheet().rest, frames[2].tool.position, 1, closed=False)) is None
+    assert estimator.skipped == []
+
+
+def test_the_same_input_gives_the_same_bytes():
+    def estimates() -> list:
+        estimator = Estimator(DECLARATION)
+        return [estimator.update(one) for one in episode()[:5]][2:]
+
+    for one, other in zip(estimates(), estimates(), strict=True):
+        for name in ("positions", "mean", "sd"):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+        assert (one.entropy, one.nis) == (other.entropy, other.nis)
+
+
+def test_a_frame_in_which_every_particle_is_hidden_is_skipped_and_named():
+    frames = episode()
+    hidden = with_points(frames[3], positions=np.full((sheet().n, 3), np.nan))
+    estimator = Estimator(DECLARATION)
+    for one in frames[:3]:
+        estimator.update(one)
+    before = estimator.belief
+    assert estimator.update(hidden) is None
+    assert estimator.skipped == [(3, "no particle was seen")]
+    np.testing.assert_array_equal(estimator.belief.covariance, before.covariance)
+    assert estimator.update(frames[4]) is not None
+
+
+def test_nan_points_are_unseen_particles():
+    """The others still say where the hidden ones are: within 2 mm, where the frame before would be 5 mm off."""
+    frames = episode()
+    positions = frames[4].points.positions.copy()
+    hidden = np.zeros(sheet().n, bool)
+    hidden[[11, 12, 30, 55]] = True
+    positions[hidden] = np.nan
+    estimator = Estimator(DECLARATION)
+    for one in frames[:4]:
+        estimator.update(one)
+    found = estimator.update(with_points(frames[4], positions=positions))
+    np.testing.assert_array_equal(np.isnan(found.observed).any(axis=1), hidden)
+    assert np.isfinite(found.positions).all()
+    assert np.linalg.norm(found.positions - lifts()[2].x, axis=1)[hidden].max() < 2e-3
+    assert np.linalg.norm(lifts()[1].x - lifts()[2].x, axis=1)[hidden].max() > 2e-3
+
+
+def test_a_cloud_without_identities_is_refused():
+    estimator = Estimator(DECLARATION)
+    with pytest.raises(PerceptionError, match="carry no track_id"):
+        for one in episode()[:3]:
+            estimator.update(with_points(one, track_id=None))
+
+
+def test_too_few_points_are_refused():
+    estimator = Estimator(DECLARATION)
+    with pytest.raises(PerceptionError, match="10 points are seen in every frame at rest; a sheet needs 20"):
+        for one in episode()[:3]:
+            points = MeasuredPoints(positions=one.points.positions[:10], track_id=np.arange(10), sd=NOISE)
+            estimator.update(dataclasses.replace(one, points=points))
+
+
+@pytest.mark.parametrize("when", [0, 3])
+def test_an_observation_with_nothing_to_see_is_refused_by_its_index(when):
+    estimator = Estimator(DECLARATION)
+    frames = episode()
+    for one in frames[:when]:
+        estimator.update(one)
+    with pytest.raises(PerceptionError, match=f"observation {when} has neither points nor images"):
+        estimator.update(dataclasses.replace(frames[when], points=None))
+
+
+def test_a_grasp_off_the_tissue_says_how_far_off():
+    estimator = Estimator(DECLARATION)
+    for one in still():
+        estimator.update(one)
+    with pytest.raises(PerceptionError, match=r"grasp 1 is off the tissue: .* mm from the nearest particle"):
+        estimator.update(observe(2, sheet().rest, np.array([0.2, 0.0, 0.0]), 1))
+
+
+def test_asking_for_the_sheet_before_the_first_grasp_is_refused():
+    estimator = Estimator(DECLARATION)
+    estimator.update(still()[0])
+    with pytest.raises(ValueError, match="not known before the first frame with closed jaws"):
+        _ = estimator.sheet
+
+
+@pytest.mark.parametrize("change", [{"spacing": 0.0}, {"prior_sd": -1.0}, {"force_sd": float("nan")}])
+def test_settings_out_of_range_are_refused(change):
+    ((name, _),) = change.items()
+    with pytest.raises(ValueError, match=rf"EstimatorConfig\.{name} must be above 0"):
+        EstimatorConfig(**change)
+
+
+@pytest.mark.parametrize("ask", ["belief", "detection"])
+def test_asking_for_results_before_the_first_grasp_is_refused_in_words(ask):
+    with pytest.raises(ValueError, match="not known before the first frame with closed jaws"):
+        getattr(Estimator(DECLARATION), ask)
