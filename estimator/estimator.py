@@ -23,7 +23,7 @@ from jiggle_mj.estimator.surrogate import Membrane, surrogate
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
-from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, ToolState
+from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
 
@@ -156,12 +156,12 @@ class Estimator:
         hold, before = self._grip(track, tool)
         evidence, start = self._evidence(track, tool, hold, before)
         update = _update(self._filter, self._belief, jnp.asarray(self._b), evidence, jnp.asarray(start))
-        self._hold, self._belief = hold, update.belief
-        self._x, self._b = np.asarray(update.x), np.asarray(update.b)
-        if not np.isfinite(self._x).all():
+        if not (np.isfinite(update.x).all() and np.isfinite(update.b).all()):
             raise PerceptionError(
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
             )
+        self._hold, self._belief = hold, update.belief
+        self._x, self._b = np.asarray(update.x), np.asarray(update.b)
         return Estimate(
             index=observation.index,
             time=observation.time,
@@ -185,7 +185,7 @@ class Estimator:
         """Use a frame before the first grasp: the first image, every cloud of points."""
         if observation.images is not None and self._stereo is not None:
             if self._sheet is None:
-                self._sheet = self._stereo.start(observation.images, observation.tool)
+                self._start(observation.index, observation.images, observation.tool)
         elif observation.points is not None:
             if not (observation.tool.closed and self._still):
                 self._still.append(observation.points)
@@ -193,6 +193,16 @@ class Estimator:
             raise PerceptionError(
                 f"observation {observation.index} has neither points nor images with a calibrated camera."
             )
+
+    def _start(self, index: int, images: StereoPair, tool: ToolState) -> None:
+        """Lay the mesh over an image; one that cannot be used is passed over while another may come."""
+        assert self._stereo is not None
+        try:
+            self._sheet = self._stereo.start(images, tool)
+        except PerceptionError as failure:
+            if tool.closed:
+                raise
+            self.skipped.append((index, str(failure)))
 
     def _begin(self) -> ImplicitFilter:
         """Build the model once the rest shape is known."""
@@ -247,7 +257,9 @@ class Estimator:
         return Evidence(y=jnp.asarray(y), precision=jnp.asarray(precision), held=jnp.asarray(held)), start
 
     def _named(self, tool: ToolState) -> Bool[np.ndarray, " n"] | None:
-        """Particles that the recording or the declaration says are held."""
+        """Particles that the recording or the declaration says are held; only points have names."""
+        if not len(self._points.ids):
+            return None
         if tool.held_tracks:
             return np.isin(self._points.ids, tool.held_tracks)
         return None if self.declaration.mesh is None else self.declaration.mesh.held

@@ -65,7 +65,8 @@ def run_scene(
     Raises:
         JiggleError: what any of the parts raises.
     """
-    prepare_directory(directory, overwrite=overwrite)
+    own = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
+    prepare_directory(directory, own, overwrite=overwrite)
     watch = Stopwatch()
     with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference:
         estimator = Estimator(reference.declaration, reference.camera, config=config)
@@ -107,7 +108,7 @@ def run_estimator(
         JiggleError: what any of the parts raises.
     """
     recording = Recording.open(recording_path, allow_truncated=allow_truncated)
-    prepare_directory(directory, overwrite=overwrite)
+    prepare_directory(directory, (ESTIMATE, RESULT, REPORT), overwrite=overwrite)
     estimator = Estimator(recording.declaration, recording.camera, config=config)
     name = recording.metadata.get("name", recording_path.stem)
     episode = estimate(recording, estimator, directory / ESTIMATE, metadata=_name(name), on_frame=on_frame)
@@ -127,14 +128,17 @@ def run_estimator(
 def score_directory(directory: Path, truth: Path) -> Json:
     """Score an estimate that lies in a folder, and write its report anew with the truth beside it.
 
+    Its pictures come from the folder's run.mcap, or from the recording beside the truth file.
+
     Raises:
         RecordingError: the folder holds no estimate, or the file no truth.
         OutputError: the estimate did not finish.
     """
     figures = score(directory, truth)
     read = read_estimate(directory / ESTIMATE)
-    recording = directory / RECORDING
-    _report(directory, read, figures, recording=recording if recording.exists() else None, truth=read_truth(truth))
+    beside = truth.with_name(truth.name.replace(".truth.", "."))
+    recording = next((path for path in (directory / RECORDING, beside) if path != truth and path.exists()), None)
+    _report(directory, read, figures, recording=recording, truth=read_truth(truth))
     return figures
 
 

@@ -211,6 +211,8 @@ def main() -> None:
             description="Find where a tissue is attached, how strongly and how surely, from pulls seen by a camera.",
         )
     except (SceneError, OutputError, ValueError) as failure:
+        if type(failure).__name__ == "LinAlgError":  # numpy's is a ValueError, and no wrong argument
+            raise
         _stop(failure, 2)
     except JiggleError as failure:
         _stop(failure, 1)

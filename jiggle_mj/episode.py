@@ -53,21 +53,28 @@ class Stopwatch:
         self.seconds += time.perf_counter() - self._began
 
 
-def prepare_directory(directory: Path, *, overwrite: bool) -> None:
-    """Make an output folder, and clear it of an earlier run's files if that is allowed.
+def prepare_directory(directory: Path, names: Iterable[str], *, overwrite: bool) -> None:
+    """Make an output folder, and clear it of the files that are about to be written if that is allowed.
+
+    Args:
+        directory: the folder.
+        names: of the files to come.
+        overwrite: replace files that are there.
 
     Raises:
-        OutputError: it holds results, or is a file.
+        OutputError: it holds results, is a file, or cannot be made.
     """
     if directory.exists() and not directory.is_dir():
         raise OutputError(f"{directory} is a file; give a folder for the results.")
-    names = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
     there = [name for name in names if (directory / name).exists()]
     if there and not overwrite:
         raise OutputError(f"{directory} already holds {', '.join(there)}; choose another folder or pass --overwrite.")
-    directory.mkdir(parents=True, exist_ok=True)
-    for name in there:
-        (directory / name).unlink()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for name in there:
+            (directory / name).unlink()
+    except OSError as failure:
+        raise OutputError(f"{directory} cannot be written ({failure.strerror}); give another folder.") from failure
 
 
 def observe(
@@ -121,6 +128,8 @@ def observe(
                 recording.write(observation)
                 truth_file.write(reference.truth_frame())
             yield observation
+        if truth_file is not None:
+            truth_file.conclude(reference.truth().details)
 
 
 def estimate(

@@ -36,7 +36,7 @@ class Estimate:
     entropy: float
     """Differential entropy of the belief [nat]."""
     nis: float
-    """Normalised innovation squared per degree of freedom."""
+    """Normalised innovation squared per degree of freedom, before the update."""
     boundary_energy: float
     """Mean energy in the attachments per particle, at the mean [J]."""
     update_s: float

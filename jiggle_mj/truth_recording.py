@@ -59,6 +59,7 @@ class TruthWriter:
         overwrite: bool = False,
     ) -> None:
         text = json.dumps(details, sort_keys=True)
+        self._scene = scene
         self._output = McapOutput(path, overwrite=overwrite)
         self._output.metadata(METADATA, file_metadata())
         self._output.metadata(DETAILS, {"scene": scene, "details": text})
@@ -83,6 +84,10 @@ class TruthWriter:
         output.message(TOOL, time, tool)
         output.json(FRAME, time, {"index": int(frame.index)}, schema=FRAME_SCHEMA)
         output.flush()
+
+    def conclude(self, details: dict[str, object]) -> None:
+        """Write the details again, with what only the end could know; a reader takes the last."""
+        self._output.metadata(DETAILS, {"scene": self._scene, "details": json.dumps(details, sort_keys=True)})
 
     def close(self) -> None:
         """Write the index and close the file."""

@@ -1,4 +1,4 @@
-"""A small sheet that several tests share, so that JAX compiles its shapes once, and lifts of it by the estimator's engine."""
+"""A small sheet that several tests share, so that JAX compiles its shapes once, and lifts of it by our own engine."""
 
 from dataclasses import dataclass
 from functools import cache

@@ -1,4 +1,4 @@
-"""The energy's terms: derivatives against autodiff and differences, invariance, and closed forms of membrane and plate."""
+"""The energy's terms: derivatives against autodiff and differences, invariance, closed forms of membrane and plate."""
 
 import dataclasses
 
@@ -179,7 +179,7 @@ def test_a_triangle_membrane_in_uniaxial_tension_has_the_typed_modulus_and_poiss
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 1.2])
 def test_edge_springs_on_equilateral_triangles_have_modulus_k_and_poissons_ratio_a_third(angle):
-    """Small uniaxial strain e with lateral -e/3 stores k e^2 / 2 per area, in every direction, the least over the lateral."""
+    """Small uniaxial strain e with lateral -e/3 stores k e^2 / 2 per area in every direction, the least over the lateral."""
     mesh = equilateral(5, 5)
     term = EdgeMembrane.build(mesh, stiffness=K)
     axes = Rotation.from_euler("z", angle).as_matrix()
@@ -222,7 +222,7 @@ def test_a_sheet_bent_to_a_cylinder_stores_half_b_c_squared_per_area(jitter, tol
 def test_the_bed_only_pushes():
     bed = terms()["bed"]
     assert isinstance(bed, Bed)
-    above, below = (jnp.asarray(MESH.rest + [0, 0, z])[bed.vertices] for z in (1e-4, -1e-4))
+    above, below = (jnp.asarray(MESH.rest + np.array([0, 0, z]))[bed.vertices] for z in (1e-4, -1e-4))
     np.testing.assert_array_equal(bed.gradient(above), 0)
     np.testing.assert_allclose(bed.gradient(below)[:, 0, 2], -10.0 * 1e-4, rtol=1e-9)
 

@@ -62,7 +62,7 @@ def test_the_end_does_not_depend_on_the_start(lifted):
 
 
 def test_a_search_cut_short_says_that_it_has_not_converged(lifted):
-    energy, b, found = lifted
+    energy, b, _ = lifted
     short = search(energy, b, jnp.asarray(sheet().rest), max_steps=2)
     assert not bool(short.converged)
     assert int(short.steps) == 2

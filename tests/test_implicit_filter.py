@@ -1,4 +1,4 @@
-"""The implicit filter: attachments found on its own engine, the dense formula, missing particles, honest uncertainty."""
+"""The implicit filter: attachments on its own engine, the dense formula, missing particles, honest uncertainty."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.block_tridiagonal import (
@@ -51,7 +52,7 @@ class Update(eqx.Module):
     b: Float[Array, " n"]
     """Non-negative mean [N/m]."""
     nis: Float[Array, ""]
-    """Squared residuals, whitened, per degree of freedom; 1 where the stated noises are right."""
+    """Normalised innovation squared per degree of freedom, before the update; 1 where the stated noises are right."""
 
 
 class ImplicitFilter(eqx.Module):
@@ -117,15 +118,11 @@ class ImplicitFilter(eqx.Module):
             start: where the search for the state begins [m].
         """
         frame = self._approach(self._settle(start, b, evidence), b, evidence)
-        gained, shift = self._information(frame, b)
-        belief = belief.add(gained, shift)
+        belief = belief.add(*self._information(frame, b))
+        nis = self._normalised_innovation(frame, belief, evidence)
         b = belief.non_negative_mean(b > 0)
         x = self._polish(frame, b, evidence)
-        observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
-        degrees = observed - 3 * jnp.sum(evidence.held)
-        return Update(
-            belief=belief, x=x, b=b, nis=2 * self._cost(x, b, evidence) / jnp.maximum(degrees, 1).astype(x.dtype)
-        )
+        return Update(belief=belief, x=x, b=b, nis=nis)
 
     def _force_weight(self, evidence: Evidence) -> Float[Array, " n"]:
         return jnp.where(evidence.held, 0.0, self.force_sd**-2)
@@ -233,10 +230,29 @@ class ImplicitFilter(eqx.Module):
         Z = solve_lower(frame.factor, V)
         gained = jnp.diag(w * jnp.sum(frame.d**2, axis=1)) - jnp.einsum("bki,bkj->ij", Z, Z)
 
-        residual = frame.gradient + self._apply(frame.rows, frame.off)
-        back = solve(layout, frame.factor, self._transposed(frame.rows, w[:, None] * residual))
-        whitened = w[:, None] * (residual - self._apply(frame.rows, back))
+        _, whitened = self._residual(frame)
         return gained, gained @ b - jnp.sum(frame.d * whitened, axis=1)
+
+    def _residual(self, frame: "_Frame") -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        """The unbalanced force e at the observed positions [N], and N^-1 e."""
+        w = frame.weight[:, None]
+        residual = frame.gradient + self._apply(frame.rows, frame.off)
+        back = solve(self.layout, frame.factor, self._transposed(frame.rows, w * residual))
+        return residual, w * (residual - self._apply(frame.rows, back))
+
+    def _normalised_innovation(
+        self, frame: "_Frame", posterior: BoundaryBelief, evidence: Evidence
+    ) -> Float[Array, ""]:
+        """e^T (N + D Sigma D^T)^-1 e per degree of freedom, with e and Sigma from before the frame.
+
+        By Woodbury's identity e^T N^-1 e - s^T (Sigma^-1 + D^T N^-1 D)^-1 s with s = D^T N^-1 e.
+        """
+        residual, whitened = self._residual(frame)
+        s = jnp.sum(frame.d * whitened, axis=1)
+        explained = s @ cho_solve((jnp.linalg.cholesky(posterior.precision), True), s)
+        observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
+        degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.held), 1)
+        return (jnp.sum(residual * whitened) - explained) / degrees.astype(s.dtype)
 
     def _apply(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """H v."""

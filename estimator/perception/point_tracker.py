@@ -28,7 +28,7 @@ class PointTracker:
         """Track id of each particle, -1 where nothing is measured."""
 
     def start(self, still: list[MeasuredPoints]) -> Sheet:
-        """Lay the mesh over the mean of one or more frames at rest.
+        """Lay the mesh over the mean of one or more frames at rest; points far from all others are left out.
 
         Raises:
             PerceptionError: points without identities, or too few of them.
@@ -47,8 +47,11 @@ class PointTracker:
             flat = SheetPlane.through(rest).flatten(rest)
             edges = triangulate(flat, np.inf)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
             longest = LONGEST_EDGE * np.median(np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1))
-            sheet = Sheet(rest=rest, faces=triangulate(flat, float(longest)))
-            rest_variance = np.full(len(ids), still[0].sd ** 2 / len(still))
+            faces = triangulate(flat, float(longest))
+            used, faces = np.unique(faces, return_inverse=True)
+            self.ids = self.ids[used]
+            sheet = Sheet(rest=rest[used], faces=faces.reshape(-1, 3))
+            rest_variance = np.full(len(used), still[0].sd ** 2 / len(still))
         self._rest_variance: Float[np.ndarray, " n"] = rest_variance
         return sheet
 

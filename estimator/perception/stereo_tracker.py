@@ -55,7 +55,7 @@ NOISE_FACTOR = 3.1
 neighbours, and robust weights make the residuals look small. Measured with image noise of 0 to 6 grey levels."""
 TREND_FACTOR = 0.6
 """Lateral error of a particle for each pixel that it is off its neighbours' trend, measured."""
-PERSISTENCE = 1.6
+PERSISTENCE = 2.2
 """Variances are stated this many times larger than they are in one frame: part of an error stays from frame to frame,
 and the filter takes each frame's as new. Set by the belief's NEES on the shipped scenes."""
 LEAST_SHARE = 0.7

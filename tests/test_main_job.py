@@ -1,0 +1,46 @@
+"""The main job: rendered stereo in, attachments out."""
+
+import json
+from pathlib import Path
+
+import pytest
+from jiggle_mj.eval.experiment import run_scene
+from jiggle_mj.scenes import load_scene
+from tiny_scene import SCENE, call
+
+SMALL = SCENE.replace("spacing = 7e-3", "spacing = 4.5e-3").replace("size = [0.06, 0.06]", "size = [0.07, 0.07]")
+
+
+@pytest.mark.render
+def test_a_disc_is_found_from_images_alone_and_scored_again_from_the_recording(tmp_path, monkeypatch, capsys):
+    """All that is reported lies within a ring of the disc and covers it within a ring; `estimate` on the recording
+    then reports the same particles, and `score` finds pictures beside the truth."""
+    scene = tmp_path / "small.toml"
+    scene.write_text(SMALL)
+    assert call(monkeypatch, "run", scene, "--out", tmp_path / "run", "--json") == 0
+    figures = json.loads(capsys.readouterr().out)
+    ring = figures["detection"]["by_dilation"]["1"]
+    assert ring["pcd"] >= 0.95 and ring["pug"] >= 0.95
+    assert figures["tracking"]["rms_m"] <= 0.6e-3
+
+    recording, again = tmp_path / "run" / "run.mcap", tmp_path / "again"
+    assert call(monkeypatch, "estimate", recording, "--out", again) == 0
+    assert call(monkeypatch, "score", again, "--truth", recording.with_name("run.truth.mcap")) == 0
+    scored = json.loads((again / "result.json").read_text())
+    assert scored["detection"] == figures["detection"]
+    assert "data:image/jpeg" in (again / "report.html").read_text()
+
+    assert call(monkeypatch, "estimate", recording, "--out", tmp_path / "run", "--overwrite") == 0
+    assert recording.exists() and recording.with_name("run.truth.mcap").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.render
+@pytest.mark.parametrize("name", ["arc", "line", "u_shape"])
+def test_shipped_shapes_are_found_within_one_ring_from_images_alone(name: str, tmp_path: Path):
+    """PCD and PUG at one ring >= 0.95, tracking RMS <= 0.6 mm, NEES per degree of freedom in [0.5, 2]."""
+    figures = run_scene(load_scene(name), tmp_path / name)
+    ring = figures["detection"]["by_dilation"]["1"]
+    assert ring["pcd"] >= 0.95 and ring["pug"] >= 0.95
+    assert figures["tracking"]["rms_m"] <= 0.6e-3
+    assert 0.5 <= figures["calibration"]["nees_per_dof"] <= 2
