@@ -9,7 +9,7 @@ float32 covariance of 600 stiffnesses loses definiteness.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
+from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 
@@ -44,8 +44,7 @@ class BoundaryBelief(eqx.Module):
 
     def entropy(self) -> Float[Array, ""]:
         """Differential entropy n/2 (1 + ln 2 pi) - 1/2 ln det Lambda [nat]; the paper's form lacks the second half."""
-        half_log_det = jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(self.precision))))
-        return 0.5 * len(self.shift) * (1 + jnp.log(2 * jnp.pi)) - half_log_det
+        return entropy(jnp.linalg.cholesky(self.precision))
 
     def non_negative_mean(self, free: Bool[Array, " n"] | None = None) -> Float[Array, " n"]:
         """The most probable b >= 0: argmin 1/2 z^T Lambda z - eta^T z over z >= 0 [N/m].
@@ -56,6 +55,17 @@ class BoundaryBelief(eqx.Module):
         conditions of optimality, and only one of them once exchanging all stops to help.
         """
         return non_negative_minimum(self.precision, self.shift, self.shift > 0 if free is None else free)
+
+
+def entropy(factor: Float[Array, "n n"]) -> Float[Array, ""]:
+    """Differential entropy [nat] of a Gaussian whose precision has this Cholesky factor."""
+    return 0.5 * len(factor) * (1 + jnp.log(2 * jnp.pi)) - jnp.sum(jnp.log(jnp.diagonal(factor)))
+
+
+def standard_deviations(factor: Float[Array, "n n"]) -> Float[Array, " n"]:
+    """Square roots of the diagonal of (L L^T)^-1."""
+    inverse = solve_triangular(factor, jnp.eye(len(factor), dtype=factor.dtype), lower=True)
+    return jnp.sqrt(jnp.sum(inverse**2, axis=0))
 
 
 def non_negative_minimum(

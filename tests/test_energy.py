@@ -179,7 +179,7 @@ def test_a_triangle_membrane_in_uniaxial_tension_has_the_typed_modulus_and_poiss
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 1.2])
 def test_edge_springs_on_equilateral_triangles_have_modulus_k_and_poissons_ratio_a_third(angle):
-    """Small uniaxial strain e with lateral -e/3 stores k e^2 / 2 per area in every direction, the least over the lateral."""
+    """Small uniaxial strain e with lateral -e/3 stores k e^2 / 2 per area in any direction, least over the lateral."""
     mesh = equilateral(5, 5)
     term = EdgeMembrane.build(mesh, stiffness=K)
     axes = Rotation.from_euler("z", angle).as_matrix()

@@ -37,12 +37,13 @@ def evidence(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Eviden
 
 
 def run(implicit: ImplicitFilter, frames: tuple[Lift, ...], seed: int):
-    belief, b = BoundaryBelief.prior(sheet().n, mean=0.0, sd=PRIOR_SD), jnp.zeros(sheet().n)
+    belief, b, outcomes = BoundaryBelief.prior(sheet().n, mean=0.0, sd=PRIOR_SD), jnp.zeros(sheet().n), []
     for k, frame in enumerate(frames):
         seen = evidence(frame, 100 * seed + k)
         out = update(implicit, belief, b, seen, seen.y)
         belief, b = out.belief, out.b
-    return out
+        outcomes.append(out)
+    return outcomes[-1]
 
 
 @pytest.fixture(scope="module")

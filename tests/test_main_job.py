@@ -39,7 +39,8 @@ def test_a_disc_is_found_from_images_alone_and_scored_again_from_the_recording(t
 @pytest.mark.parametrize("name", ["arc", "line", "u_shape"])
 def test_shipped_shapes_are_found_within_one_ring_from_images_alone(name: str, tmp_path: Path):
     """PCD and PUG at one ring >= 0.95, tracking RMS <= 0.6 mm, NEES per degree of freedom in [0.5, 2]."""
-    figures = run_scene(load_scene(name), tmp_path / name)
+    run_scene(load_scene(name), tmp_path / name)
+    figures = json.loads((tmp_path / name / "result.json").read_text())
     ring = figures["detection"]["by_dilation"]["1"]
     assert ring["pcd"] >= 0.95 and ring["pug"] >= 0.95
     assert figures["tracking"]["rms_m"] <= 0.6e-3

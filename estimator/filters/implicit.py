@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float, Int
-from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
 from jiggle_mj.estimator.block_tridiagonal import (
     BlockCholesky,
     Layout,
@@ -51,6 +51,10 @@ class Update(eqx.Module):
     """State after the update [m]."""
     b: Float[Array, " n"]
     """Non-negative mean [N/m]."""
+    sd: Float[Array, " n"]
+    """Standard deviation of each b, without the constraint [N/m]."""
+    entropy: Float[Array, ""]
+    """Of the belief [nat]."""
     nis: Float[Array, ""]
     """Normalised innovation squared per degree of freedom, before the update; 1 where the stated noises are right."""
 
@@ -119,10 +123,11 @@ class ImplicitFilter(eqx.Module):
         """
         frame = self._approach(self._settle(start, b, evidence), b, evidence)
         belief = belief.add(*self._information(frame, b))
-        nis = self._normalised_innovation(frame, belief, evidence)
+        factor = jnp.linalg.cholesky(belief.precision)
+        nis = self._normalised_innovation(frame, factor, evidence)
         b = belief.non_negative_mean(b > 0)
         x = self._polish(frame, b, evidence)
-        return Update(belief=belief, x=x, b=b, nis=nis)
+        return Update(belief=belief, x=x, b=b, nis=nis, sd=standard_deviations(factor), entropy=entropy(factor))
 
     def _force_weight(self, evidence: Evidence) -> Float[Array, " n"]:
         return jnp.where(evidence.held, 0.0, self.force_sd**-2)
@@ -241,15 +246,16 @@ class ImplicitFilter(eqx.Module):
         return residual, w * (residual - self._apply(frame.rows, back))
 
     def _normalised_innovation(
-        self, frame: "_Frame", posterior: BoundaryBelief, evidence: Evidence
+        self, frame: "_Frame", posterior: Float[Array, "n n"], evidence: Evidence
     ) -> Float[Array, ""]:
         """e^T (N + D Sigma D^T)^-1 e per degree of freedom, with e and Sigma from before the frame.
 
-        By Woodbury's identity e^T N^-1 e - s^T (Sigma^-1 + D^T N^-1 D)^-1 s with s = D^T N^-1 e.
+        `posterior` is the Cholesky factor of the precision after it. By Woodbury's identity
+        e^T N^-1 e - s^T (Sigma^-1 + D^T N^-1 D)^-1 s with s = D^T N^-1 e.
         """
         residual, whitened = self._residual(frame)
         s = jnp.sum(frame.d * whitened, axis=1)
-        explained = s @ cho_solve((jnp.linalg.cholesky(posterior.precision), True), s)
+        explained = s @ cho_solve((posterior, True), s)
         observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
         degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.held), 1)
         return (jnp.sum(residual * whitened) - explained) / degrees.astype(s.dtype)
