@@ -1,8 +1,7 @@
 """Symmetric block-tridiagonal matrices over particles: layout, assembly from elements, Cholesky factorisation, solves.
 
-Particles ordered by reverse Cuthill-McKee [Cuthill & McKee 1969, doi:10.1145/800195.805928] interact only within a
-band; cutting the order into blocks as wide as the band leaves a block-tridiagonal matrix, whose Cholesky factor costs
-O(n band^2) instead of O(n^3). `Layout` holds the order, `BlockTridiagonal` the numbers. Every particle carries three
+Particles in a good order interact only within a band; cutting the order into blocks as wide as the band leaves a
+block-tridiagonal matrix, whose Cholesky factor costs O(n band^2) instead of O(n^3). `Layout` holds the order, `BlockTridiagonal` the numbers. Every particle carries three
 degrees of freedom. Not a general sparse solver: the band must fit.
 """
 
@@ -16,6 +15,10 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 
+SWEEPS = 36
+"""Directions in which an order along a line is tried."""
+
+
 class Layout(eqx.Module):
     """Which particle sits where in the blocks; the last block is padded."""
 
@@ -26,15 +29,24 @@ class Layout(eqx.Module):
     """Particles in a block."""
 
     @classmethod
-    def from_pattern(cls, pattern: sp.csr_matrix) -> "Layout":
-        """Order the particles of a symmetric n x n sparsity pattern so that it becomes block-tridiagonal."""
-        order = reverse_cuthill_mckee(pattern.tocsr(), symmetric_mode=True)
-        rank = np.empty(len(order), dtype=np.int64)
-        rank[order] = np.arange(len(order))
-        rows, columns = pattern.nonzero()
-        band = max(1, int(np.abs(rank[rows] - rank[columns]).max(initial=1)))
-        n_blocks = max(1, len(order) // band)
-        return cls(slot=rank, n_blocks=n_blocks, width=-(-len(order) // n_blocks))
+    def from_pattern(cls, pattern: sp.csr_matrix, points: Float[np.ndarray, "n d"] | None = None) -> "Layout":
+        """Order the particles of a symmetric n x n sparsity pattern so that its band is narrow.
+
+        Reverse Cuthill-McKee [Cuthill & McKee 1969, doi:10.1145/800195.805928], or, where the particles' positions
+        are given and that is narrower, along a direction in the plane of their two largest extents.
+        """
+        n, (rows, columns) = pattern.shape[0], pattern.nonzero()
+        orders = [reverse_cuthill_mckee(pattern.tocsr(), symmetric_mode=True)]
+        if points is not None:
+            centred = points - points.mean(axis=0)
+            plane = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
+            angles = np.linspace(0, np.pi, SWEEPS, endpoint=False)
+            orders += [np.argsort(plane @ (np.cos(angle), np.sin(angle)), kind="stable") for angle in angles]
+        ranks = [np.argsort(order) for order in orders]
+        bands = [max(1, int(np.abs(rank[rows] - rank[columns]).max(initial=1))) for rank in ranks]
+        best = int(np.argmin(bands))
+        n_blocks = max(1, n // bands[best])
+        return cls(slot=ranks[best], n_blocks=n_blocks, width=-(-n // n_blocks))
 
     def blocks(self, values: Float[Array, "n ..."]) -> Float[Array, "blocks width ..."]:
         """Lay particle rows out in blocks; padding is zero."""
@@ -152,6 +164,25 @@ def solve_lower(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float
 
     lower = jnp.concatenate([jnp.zeros_like(factor.inverse[:1]), factor.lower])
     return jax.lax.scan(step, jnp.zeros_like(rhs[0]), (factor.inverse, lower, rhs))[1]
+
+
+def lower_square(factor: BlockCholesky, rhs: Float[Array, "blocks m n"]) -> Float[Array, "n n"]:
+    """(L^-1 rhs)^T (L^-1 rhs) of a right-hand side with n / blocks columns a block, in the layout's order.
+
+    Columns may reach no further than one block from their own, as those of a matrix in this layout do: what lies above
+    stays zero in L^-1 rhs, and is left out of the products.
+    """
+    nb, _, n = rhs.shape
+    square = jnp.zeros((n, n), rhs.dtype)
+    z = jnp.zeros_like(rhs[0, :, :0])
+    for k in range(nb):
+        known, reach = z.shape[1], min(k + 2, nb) * (n // nb)
+        right = rhs[k, :, :reach]
+        if k:
+            right = right.at[:, :known].add(-factor.lower[k - 1] @ z)
+        z = factor.inverse[k] @ right
+        square = square.at[:reach, :reach].add(z.T @ z)
+    return square
 
 
 def solve_upper(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float[Array, "blocks m k"]:

@@ -252,7 +252,7 @@ class Estimator:
             0,
         )
         motion = np.where(known[:, None], y - before, 0.0)
-        start = before + np.where(known[:, None], motion, self._field.fill(motion, known))
+        start = before + np.where(held[:, None], motion, self._field.fill(motion, known, stiffness=1.0))
         y = np.where(known[:, None], y, start)
         return Evidence(y=jnp.asarray(y), precision=jnp.asarray(precision), held=jnp.asarray(held)), start
 

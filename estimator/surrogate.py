@@ -39,4 +39,4 @@ def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane =
         )
         if declaration.bed:
             terms.append(Bed.build(mesh.rest, up=-gravity / np.linalg.norm(gravity), stiffness=BED_STIFFNESS * k))
-    return SheetEnergy.build(mesh.rest, tuple(terms), Layout.from_pattern(mesh.adjacency))
+    return SheetEnergy.build(mesh.rest, tuple(terms), Layout.from_pattern(mesh.adjacency, mesh.rest))

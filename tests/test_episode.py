@@ -77,13 +77,13 @@ def test_a_folder_with_results_is_kept_unless_overwriting_is_allowed(tmp_path):
     for name in ("run.mcap", "mine.txt"):
         (tmp_path / name).write_text("kept")
     with pytest.raises(OutputError, match=r"already holds run\.mcap; choose another folder or pass --overwrite"):
-        prepare_directory(tmp_path, overwrite=False)
+        prepare_directory(tmp_path, ["run.mcap"], overwrite=False)
     assert (tmp_path / "run.mcap").read_text() == "kept"
-    prepare_directory(tmp_path, overwrite=True)
+    prepare_directory(tmp_path, ["run.mcap"], overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
     (tmp_path / "out").write_text("a file")
     with pytest.raises(OutputError, match="is a file; give a folder"):
-        prepare_directory(tmp_path / "out", overwrite=True)
+        prepare_directory(tmp_path / "out", ["run.mcap"], overwrite=True)

@@ -12,6 +12,8 @@ from small_sheet import DECLARATION, STIFFNESS, Lift, attached, dense, lifts, sh
 NOISE, GRIP_SD = 2e-4, 1.5e-3
 """[m]."""
 K = DECLARATION.membrane_stiffness
+FORCE_SD = 1e-4
+"""[N]; small, as the data come from the filter's own model."""
 PRIOR_SD = 0.5
 """[N/m]; half of the true stiffness."""
 THRESHOLD = 0.0125 * K
@@ -23,7 +25,7 @@ information = eqx.filter_jit(lambda f, x, b, evidence: f._information(f._lineari
 
 @pytest.fixture(scope="module")
 def implicit() -> ImplicitFilter:
-    return ImplicitFilter.build(sheet(), sheet_energy(), force_sd=4.5e-3 * K * sheet().spacing, grip_stiffness=3 * K)
+    return ImplicitFilter.build(sheet(), sheet_energy(), force_sd=FORCE_SD, grip_stiffness=3 * K)
 
 
 def evidence(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:

@@ -23,8 +23,8 @@ from jiggle_mj.estimator.block_tridiagonal import (
     add_to_diagonal,
     assemble,
     cholesky,
+    lower_square,
     solve,
-    solve_lower,
 )
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Tether
@@ -97,7 +97,7 @@ class ImplicitFilter(eqx.Module):
             for vertices in (np.asarray(term.vertices).tolist() for term in energy.terms)
         )
         coupled = sp.csr_array(near.astype(np.int64) @ near.astype(np.int64))
-        layout = Layout.from_pattern(pattern(mesh.n, np.column_stack(coupled.nonzero())))
+        layout = Layout.from_pattern(pattern(mesh.n, np.column_stack(coupled.nonzero())), mesh.rest)
         return cls(
             energy=energy,
             tethered=SheetEnergy.build(mesh.rest, (*energy.terms, Tether.build(mesh.rest)), energy.layout),
@@ -149,7 +149,7 @@ class ImplicitFilter(eqx.Module):
         stiff = self.grip_stiffness * jnp.eye(3, dtype=x.dtype)
         pull = jnp.where(evidence.held[:, None, None], stiff, pull)
         tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
-        return equilibrium(tethered, b, x, force_tolerance=self.force_sd / 40, max_steps=25).x
+        return equilibrium(tethered, b, x, force_tolerance=self.force_sd / 4, max_steps=25).x
 
     def _approach(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> "_Frame":
         """Linearise where a Gauss-Newton step on the state alone, at fixed b, gains no more than `SETTLED`."""
@@ -226,14 +226,13 @@ class ImplicitFilter(eqx.Module):
 
     def _information(self, frame: "_Frame", b: Float[Array, " n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
         """D^T N^-1 D and the shift that goes with it."""
-        n, width = self.neighbours.shape
         layout, w = self.layout, frame.weight
         spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, frame.d)
-        columns = jnp.broadcast_to(jnp.arange(n)[:, None], (n, width))
-        V = jnp.zeros((n + 1, n, 3), spread.dtype).at[self.neighbours, columns].add(spread)[:-1]
-        V = layout.blocks(V.swapaxes(1, 2)).reshape(layout.n_blocks, 3 * layout.width, n)
-        Z = solve_lower(frame.factor, V)
-        gained = jnp.diag(w * jnp.sum(frame.d**2, axis=1)) - jnp.einsum("bki,bkj->ij", Z, Z)
+        padded = layout.n_blocks * layout.width
+        slot = jnp.append(layout.slot, padded)[self.neighbours]
+        V = jnp.zeros((padded + 1, 3, padded), spread.dtype).at[slot, :, layout.slot[:, None]].add(spread)[:-1]
+        square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
+        gained = jnp.diag(w * jnp.sum(frame.d**2, axis=1)) - square[layout.slot][:, layout.slot]
 
         _, whitened = self._residual(frame)
         return gained, gained @ b - jnp.sum(frame.d * whitened, axis=1)
@@ -280,7 +279,7 @@ class _Frame(eqx.Module):
 
 SETTLED = 0.5
 """A step that lowers the cost by less than this share ends the search for the state."""
-POLISH_STEPS = 4
+POLISH_STEPS = 2
 """Steps of the state after the belief has changed."""
 FAINT = 1.0
 """Precision that keeps unseen, slack particles solvable: a standard deviation of 1 m [1/m^2]."""
