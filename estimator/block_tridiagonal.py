@@ -1,8 +1,9 @@
 """Symmetric block-tridiagonal matrices over particles: layout, assembly from elements, Cholesky factorisation, solves.
 
 Particles in a good order interact only within a band; cutting the order into blocks as wide as the band leaves a
-block-tridiagonal matrix, whose Cholesky factor costs O(n band^2) instead of O(n^3). `Layout` holds the order, `BlockTridiagonal` the numbers. Every particle carries three
-degrees of freedom. Not a general sparse solver: the band must fit.
+block-tridiagonal matrix, whose Cholesky factor costs O(n band^2) instead of O(n^3). `Layout` holds the order,
+`BlockTridiagonal` the numbers. Every particle carries three degrees of freedom. Not a general sparse solver: the band
+must fit.
 """
 
 import equinox as eqx
@@ -13,7 +14,6 @@ import scipy.sparse as sp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-
 
 SWEEPS = 36
 """Directions in which an order along a line is tried."""
@@ -91,8 +91,6 @@ class BlockCholesky(eqx.Module):
     The diagonal blocks are kept as inverses: products with them run several times faster than triangular solves.
     """
 
-    log_diagonal: Float[Array, "blocks m"]
-    """Logarithm of L's diagonal."""
     inverse: Float[Array, "blocks m m"]
     """Inverse of each diagonal block."""
     lower: Float[Array, "blocks-1 m m"]
@@ -137,12 +135,12 @@ def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
         coupling = lower @ previous.T
         factor = jnp.linalg.cholesky(diagonal - coupling @ coupling.T, symmetrize_input=False)
         inverse = solve_triangular(factor, identity, lower=True)
-        return inverse, (jnp.log(jnp.diagonal(factor)), inverse, coupling)
+        return inverse, (inverse, coupling)
 
     before_first = jnp.zeros_like(identity)
     lower = jnp.concatenate([before_first[None], matrix.lower])
-    _, (logarithm, inverse, lower) = jax.lax.scan(step, before_first, (matrix.diagonal, lower))
-    return BlockCholesky(log_diagonal=logarithm, inverse=inverse, lower=lower[1:])
+    _, (inverse, lower) = jax.lax.scan(step, before_first, (matrix.diagonal, lower))
+    return BlockCholesky(inverse=inverse, lower=lower[1:])
 
 
 def multiply(layout: Layout, matrix: BlockTridiagonal, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
@@ -202,8 +200,3 @@ def solve(layout: Layout, factor: BlockCholesky, rhs: Float[Array, "n 3"]) -> Fl
     blocks = layout.blocks(rhs).reshape(layout.n_blocks, 3 * layout.width, 1)
     z = solve_upper(factor, solve_lower(factor, blocks))
     return layout.rows(z.reshape(layout.n_blocks, layout.width, 3))
-
-
-def half_log_determinant(factor: BlockCholesky) -> Float[Array, ""]:
-    """Half of log det A."""
-    return jnp.sum(factor.log_diagonal)

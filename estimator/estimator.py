@@ -31,7 +31,7 @@ from jiggle_mj.sheet_triangulation import SheetPlane
 class EstimatorConfig:
     """Settings of the estimator; stiffnesses are shares of the declared membrane stiffness k."""
 
-    spacing: float = 4.25e-3
+    spacing: float = 4.4e-3
     """Between the particles of a mesh laid over images [m]."""
     membrane: Membrane = "triangles"
     """Law of the sheet's plane: St Venant-Kirchhoff triangles, or the paper's springs along the edges."""
@@ -43,7 +43,7 @@ class EstimatorConfig:
     """How well held particles follow the tip [m]."""
     grip_stiffness: float = 3.0
     """Of the springs that carry held particles with the tip while the state is searched [k]."""
-    detect_above: float = 0.0125
+    detect_above: float = 0.011
     """A particle is reported attached when its mean stiffness exceeds this [k]."""
 
     def __post_init__(self) -> None:

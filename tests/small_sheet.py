@@ -17,8 +17,8 @@ from jiggle_mj.observation import Declaration
 
 SPACING = 7e-3
 DECLARATION = Declaration()
-STIFFNESS = 1.0
-"""Of each attached particle [N/m], a thirtieth of the membrane's."""
+STIFFNESS = 3.0
+"""Of each attached particle [N/m], a tenth of the membrane's."""
 GRIP_RADIUS = 8e-3
 FORCE_TOLERANCE = 1e-8
 """[N]; the weight of one particle is 4e-4."""

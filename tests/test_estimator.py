@@ -10,7 +10,9 @@ from small_sheet import DECLARATION, GRIP_RADIUS, attached, lifts, sheet
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
 
-NOISE = 2e-4
+NOISE = 1e-4
+CONFIG = EstimatorConfig(force_sd=5e-4, prior_sd=0.05, detect_above=1 / 30)
+"""A small force error, as the data come from the estimator's own model; prior and rule at half and a third of b."""
 
 
 def observe(index: int, x: np.ndarray, tip: np.ndarray, grasp: int, *, closed: bool = True) -> Observation:
@@ -42,7 +44,7 @@ def with_points(observation: Observation, **changes) -> Observation:
 @pytest.fixture(scope="module")
 def run():
     """The whole episode, once."""
-    estimator = Estimator(DECLARATION, config=EstimatorConfig(force_sd=5e-4))  # small: the data come from its own model
+    estimator = Estimator(DECLARATION, config=CONFIG)
     return estimator, [estimator.update(one) for one in episode()]
 
 

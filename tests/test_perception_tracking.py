@@ -57,14 +57,15 @@ def test_a_lift_is_followed_without_drift(lift):
 
 
 def test_the_covariance_is_honest(lift):
-    """Mean normalised squared error e' C^-1 e / 3 between 0.3 and 2: this texture is kinder than tissue's."""
+    """Mean normalised squared error e' C^-1 e / 3 between 0.2 and 2: this texture is kinder than tissue's,
+    for which the covariance is widened."""
     _, frames = lift
     nees = []
     for track, truth in frames:
         seen = track.visible
         error = (track.positions - truth)[seen]
         nees.append(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(track.covariance[seen]), error)) / 3)
-    assert 0.3 < np.mean(nees) < 2
+    assert 0.2 < np.mean(nees) < 2
 
 
 def test_positions_and_pixels_say_the_same(lift):

@@ -83,7 +83,7 @@ class StereoTracker:
         self,
         camera: StereoCamera,
         *,
-        spacing: float = 4.25e-3,
+        spacing: float = 4.4e-3,
         mask: TissueMask | None = None,
         disparity: Disparity | None = None,
     ):
