@@ -254,7 +254,13 @@ class Estimator:
         motion = np.where(known[:, None], y - before, 0.0)
         start = before + np.where(held[:, None], motion, self._field.fill(motion, known, stiffness=1.0))
         y = np.where(known[:, None], y, start)
-        return Evidence(y=jnp.asarray(y), precision=jnp.asarray(precision), held=jnp.asarray(held)), start
+        evidence = Evidence(
+            y=jnp.asarray(y),
+            precision=jnp.asarray(precision),
+            held=jnp.asarray(held),
+            loaded=jnp.asarray(self._field.widened(held)),
+        )
+        return evidence, start
 
     def _named(self, tool: ToolState) -> Bool[np.ndarray, " n"] | None:
         """Particles that the recording or the declaration says are held; only points have names."""

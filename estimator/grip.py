@@ -1,7 +1,8 @@
 """Which particles the tweezer holds, and where it should have taken them.
 
 Held when the jaws close: the particles the recording names, or those within the radius of the tip. They move with the
-tip, give or take; the force on them is unknown, so the filter gives them no balance of forces.
+tip, give or take. The force on them is unknown, and so is that on their neighbours, since the true tissue's points do
+not sit where the mesh has its own: the filter gives neither a balance of forces.
 """
 
 from dataclasses import dataclass

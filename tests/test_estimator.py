@@ -10,7 +10,7 @@ from small_sheet import DECLARATION, GRIP_RADIUS, attached, lifts, sheet
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
 
-NOISE = 1e-4
+NOISE = 5e-5
 CONFIG = EstimatorConfig(force_sd=5e-4, prior_sd=0.05, detect_above=1 / 30)
 """A small force error, as the data come from the estimator's own model; prior and rule at half and a third of b."""
 

@@ -35,7 +35,8 @@ def evidence(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Eviden
     precision = np.eye(3) / sd[:, None, None] ** 2
     if unseen is not None:
         precision = np.where(unseen[:, None, None], 0.0, precision)
-    return Evidence(y=jnp.asarray(noisy), precision=jnp.asarray(precision), held=jnp.asarray(frame.held))
+    held = jnp.asarray(frame.held)
+    return Evidence(y=jnp.asarray(noisy), precision=jnp.asarray(precision), held=held, loaded=held)
 
 
 def run(implicit: ImplicitFilter, frames: tuple[Lift, ...], seed: int):
@@ -121,7 +122,10 @@ def test_a_missing_particle_has_no_influence(implicit):
     unseen[[3, 20, 44, 60]] = True
     seen = evidence(frame, 2, unseen)
     other = Evidence(
-        y=jnp.where(jnp.asarray(unseen)[:, None], seen.y + 0.3, seen.y), precision=seen.precision, held=seen.held
+        y=jnp.where(jnp.asarray(unseen)[:, None], seen.y + 0.3, seen.y),
+        precision=seen.precision,
+        held=seen.held,
+        loaded=seen.loaded,
     )
     belief, b = BoundaryBelief.prior(sheet().n, mean=0.0, sd=PRIOR_SD), jnp.zeros(sheet().n)
     one, two = (update(implicit, belief, b, e, jnp.asarray(frame.x)) for e in (seen, other))

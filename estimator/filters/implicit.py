@@ -1,10 +1,10 @@
 """Implicit extended Kalman filter: the measurement model is the equilibrium itself, with an honest force error.
 
     y = x + n_y,  n_y ~ N(0, R)         observed positions, a 3x3 block a particle, no row for a missing one
-    grad U(x; b) = n_f,  n_f ~ N(0, tau^2 I)    what the model gets wrong, in newtons; no row for a held particle
+    grad U(x; b) = n_f,  n_f ~ N(0, tau^2 I)    what the model gets wrong, in newtons; no row near the grip
 
 Gauss-Newton on (x, b), from the equilibrium of the sheet tethered to what was observed. With H the Hessian of U,
-D = blkdiag(x_i - a_i), W = tau^-2 (0 where held), A = R^-1 + H W H and N^-1 = W - W H A^-1 H W, eliminating x leaves
+D = blkdiag(x_i - a_i), W = tau^-2 (0 where loaded), A = R^-1 + H W H and N^-1 = W - W H A^-1 H W, eliminating x leaves
 for b the evidence D^T N^-1 D; each frame enters once. Linear in b at the observed state, so the wild response of a free
 sheet at b = 0 is never needed. Needs correspondences.
 """
@@ -40,7 +40,9 @@ class Evidence(eqx.Module):
     precision: Float[Array, "n 3 3"]
     """R^-1, zero where a particle is missing [1/m^2]."""
     held: Bool[Array, " n"]
-    """Particles in the grip, whose balance of forces is unknown."""
+    """Particles in the grip, which follow the tip."""
+    loaded: Bool[Array, " n"]
+    """Particles that the grip may pull at, the held ones among them, whose balance of forces is unknown."""
 
 
 class Update(eqx.Module):
@@ -130,7 +132,7 @@ class ImplicitFilter(eqx.Module):
         return Update(belief=belief, x=x, b=b, nis=nis, sd=standard_deviations(factor), entropy=entropy(factor))
 
     def _force_weight(self, evidence: Evidence) -> Float[Array, " n"]:
-        return jnp.where(evidence.held, 0.0, self.force_sd**-2)
+        return jnp.where(evidence.loaded, 0.0, self.force_sd**-2)
 
     def _cost(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> Float[Array, ""]:
         off = evidence.y - x
@@ -256,7 +258,7 @@ class ImplicitFilter(eqx.Module):
         s = jnp.sum(frame.d * whitened, axis=1)
         explained = s @ cho_solve((posterior, True), s)
         observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
-        degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.held), 1)
+        degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.loaded), 1)
         return (jnp.sum(residual * whitened) - explained) / degrees.astype(s.dtype)
 
     def _apply(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

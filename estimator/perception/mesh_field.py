@@ -45,6 +45,10 @@ class MeshField:
         factor = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         return factor.solve(np.asarray(confidence, float)[:, None] * target)
 
+    def widened(self, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """The chosen particles and those that share an edge with one."""
+        return chosen | ((self._neighbours >= 0) & chosen[self._neighbours]).any(axis=1)
+
     def stray(self, values: Float[np.ndarray, "n k"], known: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Distance of each value from the median of its known neighbours; inf where it or all of them are unknown."""
         return self._from_median(values, values[self._neighbours], known)
