@@ -62,7 +62,16 @@ def run(
     _show(figures, out, as_json)
 
 
-def record(scene: Name, /, *, out: Out, sensing: Sensing = "stereo", seed: int = 0, overwrite: bool = False) -> None:
+def record(
+    scene: Name,
+    /,
+    *,
+    out: Out,
+    sensing: Sensing = "stereo",
+    seed: int = 0,
+    overwrite: bool = False,
+    as_json: AsJson = False,
+) -> None:
     """The reference tissue alone: observations to OUT, the truth to a file of its own beside it.
 
     Args:
@@ -71,8 +80,10 @@ def record(scene: Name, /, *, out: Out, sensing: Sensing = "stereo", seed: int =
         sensing: what is recorded.
         seed: of the sensing noise.
         overwrite: replace files that are already there.
+        as_json: print what was written to stdout.
     """
     from jiggle_mj.episode import observe
+    from jiggle_mj.importing import truth_path
     from jiggle_mj.scenes import Reference, load_scene, programme
 
     loaded = load_scene(scene)
@@ -80,9 +91,13 @@ def record(scene: Name, /, *, out: Out, sensing: Sensing = "stereo", seed: int =
         _progress(sum(1 for _ in programme(loaded)), f"record {loaded.name}") as on_frame,
         Reference(loaded, seed=seed, sensing=sensing, dump_dir=out.parent) as reference,
     ):
+        n_frames = 0
         for observation in observe(reference, programme(loaded), out, seed=seed, overwrite=overwrite):
             on_frame(observation, None)
-    console.print(f"wrote {out}")
+            n_frames += 1
+    console.print(f"wrote {out}: {n_frames} frames; the truth: {truth_path(out)}")
+    if as_json:
+        print(json.dumps({"recording": str(out), "truth": str(truth_path(out)), "n_frames": n_frames}))
 
 
 def import_(

@@ -21,8 +21,8 @@ class StereoPair:
 
     left: UInt8[np.ndarray, "height width 3"]
     """RGB."""
-    right: UInt8[np.ndarray, "height width 3"]
-    """RGB."""
+    right: UInt8[np.ndarray, "_height _width 3"]
+    """RGB, of the left one's size."""
 
     def __post_init__(self) -> None:
         """Check that the two images have one size."""

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 from tiny_scene import call, scene_file
@@ -135,10 +136,23 @@ def test_bad_usage_exits_with_2(arguments, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err
 
 
-def test_record_writes_observations_and_truth_apart(whole, tmp_path, monkeypatch):
+def test_without_opengl_the_message_says_what_to_install(tmp_path, monkeypatch, capsys):
+    def fail(*_: object) -> None:
+        raise RuntimeError("no EGL device")
+
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    assert call(monkeypatch, "record", scene_file(tmp_path), "--out", tmp_path / "run.mcap") == 1
+    assert "no EGL device). Install libegl1" in capsys.readouterr().err
+    assert not (tmp_path / "run.mcap").exists()
+
+
+def test_record_writes_observations_and_truth_apart(whole, tmp_path, monkeypatch, capsys):
     _, scene, made = whole
     out = tmp_path / "run.mcap"
-    assert call(monkeypatch, "record", scene, "--out", out, "--sensing", "particles") == 0
+    assert call(monkeypatch, "record", scene, "--out", out, "--sensing", "particles", "--json") == 0
+    written = json.loads(capsys.readouterr().out)
+    assert (written["recording"], written["truth"]) == (str(out), str(tmp_path / "run.truth.mcap"))
+    assert written["n_frames"] > 12
     assert {path.name for path in tmp_path.iterdir()} == {"run.mcap", "run.truth.mcap"}
     # The same seed gives the same bytes, whichever verb recorded.
     assert out.read_bytes() == (made / "run.mcap").read_bytes()

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 from jiggle_mj.estimator import Estimator, EstimatorConfig
+from perception_plane import camera
 from small_sheet import DECLARATION, GRIP_RADIUS, attached, lifts, sheet
 
-from jiggle_mj.errors import PerceptionError
-from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
+from jiggle_mj.errors import PerceptionError, RecordingError
+from jiggle_mj.observation import MeasuredPoints, Observation, StereoPair, ToolState
 
 NOISE = 5e-5
 CONFIG = EstimatorConfig(force_sd=5e-4, prior_sd=0.05, detect_above=1 / 30)
@@ -140,6 +141,31 @@ def test_an_observation_with_nothing_to_see_is_refused_by_its_index(when):
         estimator.update(one)
     with pytest.raises(PerceptionError, match=f"observation {when} has neither points nor images"):
         estimator.update(dataclasses.replace(frames[when], points=None))
+
+
+def test_images_without_a_calibrated_camera_are_refused():
+    black = np.zeros((48, 64, 3), np.uint8)
+    pictured = dataclasses.replace(still()[0], points=None, images=StereoPair(left=black, right=black))
+    with pytest.raises(PerceptionError, match="observation 0 has neither points nor images with a calibrated camera"):
+        Estimator(DECLARATION).update(pictured)
+
+
+def test_black_images_are_skipped_by_name_until_the_jaws_close_and_refused_then():
+    black = np.zeros((300, 400, 3), np.uint8)
+    first, _, closed = (
+        dataclasses.replace(one, points=None, images=StereoPair(left=black, right=black)) for one in episode()[:3]
+    )
+    estimator = Estimator(DECLARATION, camera())
+    assert estimator.update(first) is None
+    ((index, why),) = estimator.skipped
+    assert index == 0 and "black" in why
+    with pytest.raises(PerceptionError, match="black"):
+        estimator.update(closed)
+
+
+def test_images_of_two_sizes_are_refused():
+    with pytest.raises(RecordingError, match=r"differ in size: left \(48, 64, 3\), right \(48, 63, 3\)"):
+        StereoPair(left=np.zeros((48, 64, 3), np.uint8), right=np.zeros((48, 63, 3), np.uint8))
 
 
 def test_a_grasp_off_the_tissue_says_how_far_off():
