@@ -6,6 +6,7 @@ goes perception -> grip -> filter. Sees nothing but observations, the camera's c
 
 import time
 from dataclasses import dataclass
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.perception import Disparity, PointTracker, StereoTracker, TissueMask, Track
 from jiggle_mj.estimator.perception.mesh_field import MeshField
 from jiggle_mj.estimator.surrogate import Membrane, surrogate
+from threadpoolctl import ThreadpoolController
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
@@ -134,7 +136,7 @@ class Estimator:
         Raises:
             PerceptionError: the sheet cannot be found in the first frames, or a grasp is off the tissue.
         """
-        with jax.enable_x64(True):
+        with jax.enable_x64(True), _blas().limit(limits=1, user_api="blas"):
             return self._update(observation)
 
     def _update(self, observation: Observation) -> Estimate | None:
@@ -272,3 +274,9 @@ class Estimator:
 
 
 _update = eqx.filter_jit(ImplicitFilter.update)
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """BLAS's own threads get in the way of XLA's: on two cores, an update with both takes half as long again."""
+    return ThreadpoolController()

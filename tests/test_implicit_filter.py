@@ -20,7 +20,12 @@ THRESHOLD = STIFFNESS / 3
 """[N/m]."""
 
 update = eqx.filter_jit(ImplicitFilter.update)
-information = eqx.filter_jit(lambda f, x, b, evidence: f._information(f._linearise(x, b, evidence), b))
+
+
+@eqx.filter_jit
+def information(implicit: ImplicitFilter, x, b, evidence: Evidence):
+    frame = implicit._linearise(x, b, evidence)
+    return implicit._information(frame, b, implicit._residual(frame)[1])
 
 
 @pytest.fixture(scope="module")

@@ -124,9 +124,10 @@ class ImplicitFilter(eqx.Module):
             start: where the search for the state begins [m].
         """
         frame = self._approach(self._settle(start, b, evidence), b, evidence)
-        belief = belief.add(*self._information(frame, b))
+        residual, whitened = self._residual(frame)
+        belief = belief.add(*self._information(frame, b, whitened))
         factor = jnp.linalg.cholesky(belief.precision)
-        nis = self._normalised_innovation(frame, factor, evidence)
+        nis = self._normalised_innovation(frame, residual, whitened, factor, evidence)
         b = belief.non_negative_mean(b > 0)
         x = self._polish(frame, b, evidence)
         return Update(belief=belief, x=x, b=b, nis=nis, sd=standard_deviations(factor), entropy=entropy(factor))
@@ -223,10 +224,13 @@ class ImplicitFilter(eqx.Module):
     ) -> Float[Array, "n 3"]:
         """Move of the state at x for fixed b, with the factor of `frame`; Gauss-Newton's if x is its state."""
         pull = jnp.einsum("nij,nj->ni", evidence.precision, evidence.y - x)
-        push = self._transposed(self._rows(x, b), frame.weight[:, None] * self.energy.gradient(x, b))
+        gradient = lambda y: self.energy.gradient(y, b)  # noqa: E731
+        push = jax.jvp(gradient, (x,), (frame.weight[:, None] * gradient(x),))[1]
         return solve(self.layout, frame.factor, pull - push)
 
-    def _information(self, frame: "_Frame", b: Float[Array, " n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    def _information(
+        self, frame: "_Frame", b: Float[Array, " n"], whitened: Float[Array, "n 3"]
+    ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
         """D^T N^-1 D and the shift that goes with it."""
         layout, w = self.layout, frame.weight
         spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, frame.d)
@@ -235,8 +239,6 @@ class ImplicitFilter(eqx.Module):
         V = jnp.zeros((padded + 1, 3, padded), spread.dtype).at[slot, :, layout.slot[:, None]].add(spread)[:-1]
         square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
         gained = jnp.diag(w * jnp.sum(frame.d**2, axis=1)) - square[layout.slot][:, layout.slot]
-
-        _, whitened = self._residual(frame)
         return gained, gained @ b - jnp.sum(frame.d * whitened, axis=1)
 
     def _residual(self, frame: "_Frame") -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
@@ -247,14 +249,18 @@ class ImplicitFilter(eqx.Module):
         return residual, w * (residual - self._apply(frame.rows, back))
 
     def _normalised_innovation(
-        self, frame: "_Frame", posterior: Float[Array, "n n"], evidence: Evidence
+        self,
+        frame: "_Frame",
+        residual: Float[Array, "n 3"],
+        whitened: Float[Array, "n 3"],
+        posterior: Float[Array, "n n"],
+        evidence: Evidence,
     ) -> Float[Array, ""]:
         """e^T (N + D Sigma D^T)^-1 e per degree of freedom, with e and Sigma from before the frame.
 
         `posterior` is the Cholesky factor of the precision after it. By Woodbury's identity
         e^T N^-1 e - s^T (Sigma^-1 + D^T N^-1 D)^-1 s with s = D^T N^-1 e.
         """
-        residual, whitened = self._residual(frame)
         s = jnp.sum(frame.d * whitened, axis=1)
         explained = s @ cho_solve((posterior, True), s)
         observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
