@@ -37,6 +37,10 @@ class BoundaryBelief(eqx.Module):
         precision = cho_solve((jnp.linalg.cholesky(covariance), True), jnp.eye(len(mean)))
         return BoundaryBelief(precision=precision, shift=precision @ (mean + change))
 
+    def mean(self) -> Float[Array, " n"]:
+        """Without the constraint b >= 0 [N/m]."""
+        return cho_solve((jnp.linalg.cholesky(self.precision), True), self.shift)
+
     def moments(self) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
         """Mean [N/m] and covariance [N^2/m^2]."""
         factor = (jnp.linalg.cholesky(self.precision), True)

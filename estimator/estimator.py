@@ -91,6 +91,8 @@ class Estimator:
         self._sheet: Sheet | None = None
         self._filter: ImplicitFilter | None = None
         self._hold: GripHold | None = None
+        self._closing: ToolState | None = None
+        self._used = False
 
     @property
     def sheet(self) -> Sheet:
@@ -134,10 +136,19 @@ class Estimator:
         """Take one observation; None when it only helps to fix the rest shape, or cannot be used.
 
         Raises:
-            PerceptionError: the sheet cannot be found in the first frames, or a grasp is off the tissue.
+            PerceptionError: the sheet cannot be found in the first frames, or the first grasp is off the tissue. Once
+                there is an estimate, a frame that cannot be used goes to `skipped` instead.
         """
         with jax.enable_x64(True), _blas().limit(limits=1, user_api="blas"):
-            return self._update(observation)
+            try:
+                found = self._update(observation)
+            except PerceptionError as failure:
+                if not self._used:
+                    raise
+                self.skipped.append((observation.index, str(failure)))
+                return None
+        self._used |= found is not None
+        return found
 
     def _update(self, observation: Observation) -> Estimate | None:
         tool = observation.tool
@@ -147,8 +158,10 @@ class Estimator:
                 return None
             self._filter = self._begin()
         if not tool.closed:
-            self._hold = None
+            self._hold = self._closing = None
             return None
+        if self._closing is None or self._closing.grasp != tool.grasp:
+            self._closing = tool
         began = time.perf_counter()
         track = self._see(observation)
         seen = time.perf_counter()
@@ -230,12 +243,21 @@ class Estimator:
         raise PerceptionError(f"observation {observation.index} has neither points nor images; one is needed.")
 
     def _grip(self, track: Track, tool: ToolState) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
-        """The grasp of this frame, and the state to start from: the last, or rest where the jaws have just closed."""
+        """The grasp of this frame, and the state to start from: the last, or rest where the jaws have just closed.
+
+        If the frame in which they closed could not be used, the sheet is taken to have been at rest in it.
+        """
         if self._hold is not None and self._hold.grasp == tool.grasp:
             return self._hold, self._x
+        assert self._closing is not None
         rest = self.sheet.rest
-        at_closing = np.where(track.visible[:, None], np.nan_to_num(track.positions), rest)
-        return GripHold.close(tool, at_closing, self._named(tool)), rest
+        seen = track.visible & (tool is self._closing)
+        at_closing = np.where(seen[:, None], np.nan_to_num(track.positions), rest)
+        try:
+            return GripHold.close(self._closing, at_closing, self._named(tool)), rest
+        except PerceptionError:
+            self._closing = None  # a later frame of this grasp may know better
+            raise
 
     def _evidence(
         self, track: Track, tool: ToolState, hold: GripHold, before: Float[np.ndarray, "n 3"]

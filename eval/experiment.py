@@ -8,12 +8,12 @@ import platform
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.estimator.perception import Disparity, TissueMask
 from jiggle_mj.eval.report import shown_steps, write_report
-from jiggle_mj.eval.score import Json, result, score, write_result
-from jiggle_mj.scenes import Reference, Scene, programme
-from jiggle_mj.scenes.reference import Sensing
+from jiggle_mj.eval.score import RECORDED, Json, result, score, write_result
 
 from jiggle_mj.episode import (
     ESTIMATE,
@@ -23,28 +23,35 @@ from jiggle_mj.episode import (
     Episode,
     OnFrame,
     Stopwatch,
+    clear_directory,
     estimate,
     observe,
     prepare_directory,
 )
 from jiggle_mj.errors import OutputError
 from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
-from jiggle_mj.importing import truth_path
+from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.observation import StereoPair
 from jiggle_mj.recording import Recording
 from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import read_truth
 
+if TYPE_CHECKING:
+    from jiggle_mj.scenes import Scene
+    from jiggle_mj.scenes.reference import Sensing
+
 PACKAGES = ("jiggle-mj", "mujoco", "jax", "numpy", "scipy", "opencv-python-headless")
 
 
 def run_scene(
-    scene: Scene,
+    scene: "Scene",
     directory: Path,
     *,
     seed: int = 0,
-    sensing: Sensing = "stereo",
+    sensing: "Sensing" = "stereo",
     config: EstimatorConfig | None = None,
+    mask: TissueMask | None = None,
+    disparity: Disparity | None = None,
     overwrite: bool = False,
     on_frame: OnFrame | None = None,
 ) -> Json:
@@ -56,6 +63,8 @@ def run_scene(
         seed: of the sensing noise; the same seed gives the same recording.
         sensing: what the estimator sees.
         config: of the estimator.
+        mask: see `Estimator`.
+        disparity: see `Estimator`.
         overwrite: replace an earlier run's files.
         on_frame: called after each frame.
 
@@ -65,13 +74,16 @@ def run_scene(
     Raises:
         JiggleError: what any of the parts raises.
     """
+    from jiggle_mj.scenes import Reference, programme  # here, so that a recording can be estimated without MuJoCo
+
     own = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
     prepare_directory(directory, own, overwrite=overwrite)
     watch = Stopwatch()
     with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference:
-        estimator = Estimator(reference.declaration, reference.camera, config=config)
+        estimator = Estimator(reference.declaration, reference.camera, config=config, mask=mask, disparity=disparity)
+        clear_directory(directory, own)
         frames = observe(reference, programme(scene), directory / RECORDING, seed=seed, watch=watch)
-        episode = estimate(frames, estimator, directory / ESTIMATE, metadata=_name(scene.name), on_frame=on_frame)
+        episode = estimate(frames, estimator, directory / ESTIMATE, metadata={RECORDED: scene.name}, on_frame=on_frame)
     unscored = _result(
         episode, scene=scene.name, seed=seed, sensing=sensing, policy="corners", simulation_s=watch.seconds
     )
@@ -87,6 +99,8 @@ def run_estimator(
     directory: Path,
     *,
     config: EstimatorConfig | None = None,
+    mask: TissueMask | None = None,
+    disparity: Disparity | None = None,
     overwrite: bool = False,
     allow_truncated: bool = False,
     on_frame: OnFrame | None = None,
@@ -97,6 +111,8 @@ def run_estimator(
         recording_path: the MCAP file.
         directory: where the files go.
         config: of the estimator.
+        mask: see `Estimator`.
+        disparity: see `Estimator`.
         overwrite: replace an earlier run's files.
         allow_truncated: use what is whole of a recording that was cut off.
         on_frame: called after each frame.
@@ -108,17 +124,18 @@ def run_estimator(
         JiggleError: what any of the parts raises.
     """
     recording = Recording.open(recording_path, allow_truncated=allow_truncated)
-    prepare_directory(directory, (ESTIMATE, RESULT, REPORT), overwrite=overwrite)
-    estimator = Estimator(recording.declaration, recording.camera, config=config)
+    own = (ESTIMATE, RESULT, REPORT)
+    prepare_directory(directory, own, overwrite=overwrite)
+    estimator = Estimator(recording.declaration, recording.camera, config=config, mask=mask, disparity=disparity)
+    clear_directory(directory, own)
     name = recording.metadata.get("name", recording_path.stem)
-    episode = estimate(recording, estimator, directory / ESTIMATE, metadata=_name(name), on_frame=on_frame)
+    episode = estimate(recording, estimator, directory / ESTIMATE, metadata={RECORDED: name}, on_frame=on_frame)
     figures = _result(
         episode,
         scene=name,
         seed=int(recording.metadata.get("seed", 0)),
         sensing=recording.metadata.get("sensing", "points" if recording.camera is None else "stereo"),
         policy="recorded",
-        skipped=tuple(recording.skipped),
     )
     write_result(directory / RESULT, figures)
     _report(directory, episode, figures, recording=recording_path)
@@ -128,7 +145,8 @@ def run_estimator(
 def score_directory(directory: Path, truth: Path) -> Json:
     """Score an estimate that lies in a folder, and write its report anew with the truth beside it.
 
-    Its pictures come from the folder's run.mcap, or from the recording beside the truth file.
+    Its pictures come from the recording beside the truth file, or from the folder's run.mcap if that is the one that
+    was estimated.
 
     Raises:
         RecordingError: the folder holds no estimate, or the file no truth.
@@ -137,9 +155,14 @@ def score_directory(directory: Path, truth: Path) -> Json:
     figures = score(directory, truth)
     read = read_estimate(directory / ESTIMATE)
     beside = truth.with_name(truth.name.replace(".truth.", "."))
-    recording = next((path for path in (directory / RECORDING, beside) if path != truth and path.exists()), None)
+    candidates = (path for path in (beside, directory / RECORDING) if path != truth and path.exists())
+    recording = next((path for path in candidates if _recorded_name(path) == read.metadata.get(RECORDED)), None)
     _report(directory, read, figures, recording=recording, truth=read_truth(truth))
     return figures
+
+
+def _recorded_name(path: Path) -> str:
+    return Recording.open(path, allow_truncated=True).metadata.get("name", path.stem)
 
 
 def _report(
@@ -177,10 +200,6 @@ def _report(
     )
 
 
-def _name(name: str) -> dict[str, str]:
-    return {"recording": name}
-
-
 def _result(
     episode: Episode,
     *,
@@ -188,7 +207,6 @@ def _result(
     seed: int,
     sensing: str,
     policy: str,
-    skipped: tuple[tuple[int, str], ...] = (),
     simulation_s: float | None = None,
 ) -> Json:
     return result(
@@ -201,6 +219,7 @@ def _result(
         estimates=episode.estimates,
         detection=episode.detection,
         prior_entropy=episode.prior_entropy,
-        skipped=sorted((*skipped, *episode.skipped)),
+        n_frames=episode.n_frames,
+        skipped=episode.skipped,
         simulation_s=simulation_s,
     )

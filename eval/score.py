@@ -25,6 +25,8 @@ from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import read_truth
 
 Json = dict[str, object]
+RECORDED = "recording"
+"""Metadata of an estimate: the name of the recording or scene that was estimated."""
 NO_AGREEMENT = {"pcd": None, "pug": None, "f1": None}
 
 
@@ -39,6 +41,7 @@ def result(
     estimates: Sequence[Estimate],
     detection: Detection,
     prior_entropy: float | None,
+    n_frames: int,
     skipped: Sequence[tuple[int, str]] = (),
     plan_s: float | None = None,
     simulation_s: float | None = None,
@@ -55,6 +58,7 @@ def result(
         estimates: one for each used frame.
         detection: what is called attached.
         prior_entropy: of the belief before any frame [nat]; None if not known.
+        n_frames: of the recording: used, skipped and those with open jaws.
         skipped: index and reason of each frame that was left out.
         plan_s: median wall time of choosing one pull [s]; None where nothing was planned.
         simulation_s: wall time of the reference tissue, all frames [s]; None for a recording.
@@ -68,7 +72,7 @@ def result(
         "estimator": estimator,
         "policy": policy,
         "n_particles": len(sheet.rest),
-        "n_frames": len(estimates) + len(skipped),
+        "n_frames": n_frames,
         "detection": {
             "rule": detection.rule,
             "n_detected": int(detection.attached.sum()),
@@ -140,6 +144,11 @@ def score(directory: Path, truth_path: Path) -> Json:
     if recording.belief is None or recording.detection is None:
         raise OutputError(f"{directory / 'estimate.mcap'} ends before its belief; estimate the recording again.")
     truth = read_truth(truth_path)
+    if recording.metadata.get(RECORDED, truth.scene) != truth.scene:
+        raise RecordingError(
+            f"{truth_path} is the truth of '{truth.scene}', and {directory} the estimate of "
+            f"'{recording.metadata[RECORDED]}'; give the truth of the same recording."
+        )
     if truth.frames and not {f.index for f in truth.frames} & {e.index for e in recording.estimates}:
         raise RecordingError(f"{truth_path} shares no frame with {directory}; give the truth of the same recording.")
     figures = with_truth(

@@ -1,20 +1,25 @@
 """Tables of many runs: each scene, sensing and seed in a folder of its own, then means and spreads as Markdown.
 
-A table that was interrupted goes on where it was: a folder with a scored result is not run again.
+A table that was interrupted goes on where it was: a folder with a scored result is not run again, unless the version or
+the estimator's settings were others. Give a new folder after any other change.
 """
 
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.eval.experiment import run_scene
-from jiggle_mj.eval.score import Json
+from jiggle_mj.eval.score import Json, read_result
 from jiggle_mj.scenes import load_scene
 from jiggle_mj.scenes.reference import Sensing
 
-from jiggle_mj.episode import RESULT
+from jiggle_mj.episode import ESTIMATE, RESULT, settings
+from jiggle_mj.estimate_recording import read_estimate
+from jiggle_mj.recording_declaration import file_metadata
+
+VERSION = "version.jiggle-mj"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +66,7 @@ def measure(
         found[row] = []
         for seed in seeds:
             folder = directory / f"{row.scene}-{row.sensing}-{seed}"
-            done = _scored(folder / RESULT)
+            done = _scored(folder)
             if done is None:
                 say(f"{row.scene}, {row.sensing}, seed {seed}")
                 done = run_scene(load_scene(row.scene), folder, seed=seed, sensing=row.sensing, overwrite=True)
@@ -81,11 +86,14 @@ def markdown(results: dict[Row, list[Json]]) -> str:
     return "\n".join(lines)
 
 
-def _scored(path: Path) -> Json | None:
-    if not path.exists():
+def _scored(folder: Path) -> Json | None:
+    """The result of a finished run with this version and the default settings."""
+    if not (folder / RESULT).exists():
         return None
-    figures = json.loads(path.read_text())
-    return figures if figures["detection"]["n_attached"] is not None else None
+    figures, made_with = read_result(folder / RESULT), read_estimate(folder / ESTIMATE).metadata
+    expected = settings(EstimatorConfig()) | {VERSION: file_metadata()[VERSION]}
+    current = all(made_with.get(name) == value for name, value in expected.items())
+    return figures if current and figures["detection"]["n_attached"] is not None else None
 
 
 def _value(run: Json, path: tuple[str, ...]) -> float | None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from jiggle_mj.camera import CameraCalibration as CameraCalibration
     from jiggle_mj.camera import StereoCamera as StereoCamera
+    from jiggle_mj.errors import ActionError as ActionError
     from jiggle_mj.errors import JiggleError as JiggleError
     from jiggle_mj.errors import MeshError as MeshError
     from jiggle_mj.errors import OutputError as OutputError
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Action",
+    "ActionError",
     "Belief",
     "CameraCalibration",
     "Declaration",
@@ -95,6 +97,7 @@ __all__ = [
 _NAMES_OF = {
     "camera": ("CameraCalibration", "StereoCamera"),
     "errors": (
+        "ActionError",
         "JiggleError",
         "MeshError",
         "OutputError",

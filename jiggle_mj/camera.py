@@ -48,7 +48,7 @@ class StereoCamera:
     """Two calibrated cameras and where the left one stands.
 
     Raises:
-        RecordingError: sizes differ, or the right camera's P[0, 3] is not negative (left and right swapped?).
+        RecordingError: sizes or rectified intrinsics differ, or the right camera's P[0, 3] is not negative (swapped?).
     """
 
     left: CameraCalibration
@@ -67,6 +67,11 @@ class StereoCamera:
             raise RecordingError(
                 f"right camera_info has P[0,3] = {self.right.P[0, 3]:.6g}; it must be -fx*baseline, below zero "
                 "(are the cameras swapped, or is the calibration monocular?)."
+            )
+        if self.left.P[0, 3] != 0 or not np.allclose(self.left.P[:, :3], self.right.P[:, :3], rtol=1e-6, atol=1e-6):
+            raise RecordingError(
+                f"the rectified cameras differ: left P = {self.left.P.tolist()}, right P = {self.right.P.tolist()}; "
+                "all but the right P[0,3] must be equal (rectify with OpenCV's CALIB_ZERO_DISPARITY)."
             )
 
     @classmethod

@@ -1,4 +1,4 @@
-"""The command line: `jiggle-mj VERB`. Results go to files and, with --json, to stdout; everything else to stderr.
+"""The command line: `jiggle-mj VERB`. Results go to files; --json prints them, all else goes to stderr.
 
 Exit codes: 0 fine, 1 the run failed, 2 bad usage (a scene, an option or an output folder that cannot be used). Heavy
 imports happen inside the verbs, so that help is quick.
@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jiggle_mj.errors import JiggleError, OutputError, SceneError
+from jiggle_mj.errors import ActionError, JiggleError, OutputError, SceneError
 
 if TYPE_CHECKING:
     from jiggle_mj.episode import OnFrame
@@ -83,7 +83,7 @@ def record(
         as_json: print what was written to stdout.
     """
     from jiggle_mj.episode import observe
-    from jiggle_mj.importing import truth_path
+    from jiggle_mj.mcap_files import truth_path
     from jiggle_mj.scenes import Reference, load_scene, programme
 
     loaded = load_scene(scene)
@@ -225,9 +225,7 @@ def main() -> None:
             prog="jiggle-mj",
             description="Find where a tissue is attached, how strongly and how surely, from pulls seen by a camera.",
         )
-    except (SceneError, OutputError, ValueError) as failure:
-        if type(failure).__name__ == "LinAlgError":  # numpy's is a ValueError, and no wrong argument
-            raise
+    except (SceneError, ActionError, OutputError) as failure:
         _stop(failure, 2)
     except JiggleError as failure:
         _stop(failure, 1)

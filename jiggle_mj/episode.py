@@ -9,16 +9,19 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jiggle_mj.errors import OutputError, PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.estimate_recording import EstimateWriter
-from jiggle_mj.estimator import Estimator
-from jiggle_mj.importing import truth_path
+from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.observation import Action, Observation
-from jiggle_mj.recording import RecordingWriter
-from jiggle_mj.scenes import Reference
+from jiggle_mj.recording import Recording, RecordingWriter
 from jiggle_mj.truth_recording import TruthWriter
+
+if TYPE_CHECKING:
+    from jiggle_mj.scenes import Reference
 
 RECORDING, ESTIMATE, RESULT, REPORT = "run.mcap", "estimate.mcap", "result.json", "report.html"
 
@@ -36,8 +39,10 @@ class Episode:
     detection: Detection
     prior_entropy: float
     """Of the belief before anything was seen [nat]."""
+    n_frames: int
+    """Of the source, those with open jaws and the skipped ones among them."""
     skipped: tuple[tuple[int, str], ...]
-    """Index and reason of each observation that the estimator could not use."""
+    """Index and reason of each frame that the recording or the estimator could not use."""
 
 
 class Stopwatch:
@@ -54,12 +59,12 @@ class Stopwatch:
 
 
 def prepare_directory(directory: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Make an output folder, and clear it of the files that are about to be written if that is allowed.
+    """Make an output folder, and check that the files to come may be written.
 
     Args:
         directory: the folder.
         names: of the files to come.
-        overwrite: replace files that are there.
+        overwrite: results that are there may be replaced; `clear_directory` does it, once nothing stands in the way.
 
     Raises:
         OutputError: it holds results, is a file, or cannot be made.
@@ -71,14 +76,25 @@ def prepare_directory(directory: Path, names: Iterable[str], *, overwrite: bool)
         raise OutputError(f"{directory} already holds {', '.join(there)}; choose another folder or pass --overwrite.")
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for name in there:
-            (directory / name).unlink()
+    except OSError as failure:
+        raise OutputError(f"{directory} cannot be written ({failure.strerror}); give another folder.") from failure
+
+
+def clear_directory(directory: Path, names: Iterable[str]) -> None:
+    """Remove an earlier run's files, so that no old report stands beside new results.
+
+    Raises:
+        OutputError: one cannot be removed.
+    """
+    try:
+        for name in names:
+            (directory / name).unlink(missing_ok=True)
     except OSError as failure:
         raise OutputError(f"{directory} cannot be written ({failure.strerror}); give another folder.") from failure
 
 
 def observe(
-    reference: Reference,
+    reference: "Reference",
     actions: Iterable[Action],
     path: Path | None = None,
     *,
@@ -132,6 +148,11 @@ def observe(
             truth_file.conclude(reference.truth().details)
 
 
+def settings(config: EstimatorConfig) -> dict[str, str]:
+    """A configuration as an estimate's metadata holds it."""
+    return {name: str(value) for name, value in asdict(config).items()}
+
+
 def estimate(
     observations: Iterable[Observation],
     estimator: Estimator,
@@ -143,7 +164,7 @@ def estimate(
     """Show observations to an estimator, one after the other.
 
     Args:
-        observations: from `observe` or a recording.
+        observations: from `observe`, or a recording.
         estimator: a fresh one.
         path: where to write the estimate; None for nowhere.
         metadata: of that file.
@@ -153,32 +174,37 @@ def estimate(
         PerceptionError: nothing was estimated at all, or what `Estimator.update` raises.
     """
     estimates: list[Estimate] = []
-    settings = {name: str(value) for name, value in asdict(estimator.config).items()}
+    n_frames = 0
     with ExitStack() as files:
         writer: EstimateWriter | None = None
         for observation in observations:
             one = estimator.update(observation)
             if one is not None:
                 if writer is None and path is not None:
-                    writer = files.enter_context(EstimateWriter(path, estimator.sheet, settings | (metadata or {})))
+                    said = settings(estimator.config) | (metadata or {})
+                    writer = files.enter_context(EstimateWriter(path, estimator.sheet, said))
                 if writer is not None:
                     writer.write(one, n_skipped=len(estimator.skipped))
                 estimates.append(one)
+            n_frames += 1
             if on_frame is not None:
                 on_frame(observation, one)
+        unread = observations.skipped if isinstance(observations, Recording) else []
+        skipped = tuple(sorted((*unread, *estimator.skipped)))
         if not estimates:
-            why = "; ".join(f"frame {index}: {reason}" for index, reason in estimator.skipped[:3])
+            why = "; ".join(f"frame {index}: {reason}" for index, reason in skipped[:3])
             raise PerceptionError(
                 f"no frame could be used ({why or 'none has closed jaws'}); the estimator learns from frames in which "
                 "the tool holds the tissue."
             )
         if writer is not None:
-            writer.finish(estimator.belief, estimator.detection, skipped=estimator.skipped)
+            writer.finish(estimator.belief, estimator.detection, skipped=skipped)
     return Episode(
         sheet=estimator.sheet,
         estimates=tuple(estimates),
         belief=estimator.belief,
         detection=estimator.detection,
         prior_entropy=estimator.prior_entropy,
-        skipped=tuple(estimator.skipped),
+        n_frames=n_frames + len(unread),
+        skipped=skipped,
     )

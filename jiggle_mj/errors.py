@@ -24,6 +24,10 @@ class MeshError(JiggleError):
     """A mesh is degenerate, inverted or in several pieces."""
 
 
+class ActionError(JiggleError):
+    """The tissue cannot do what an action asks: a grasp off it or while grasping, a release of nothing."""
+
+
 class RenderError(JiggleError):
     """No offscreen OpenGL on this machine."""
 

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.import_declaration import Extension, GraspPath, MeasuredRecording, Rows, read_recording_toml
+from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.observation import DeclaredMesh, MeasuredPoints, Observation, ToolState
 from jiggle_mj.point_files import read_faces, read_frames, read_rows
@@ -48,11 +49,6 @@ class ImportSummary:
     """Name and reason of each frame that was left out."""
 
 
-def truth_path(recording: Path) -> Path:
-    """Where the truth of a recording goes: run.mcap, run.truth.mcap."""
-    return recording.with_suffix(".truth.mcap")
-
-
 def import_folder(
     folder: str | os.PathLike[str],
     recording_toml: str | os.PathLike[str] | None,
@@ -75,10 +71,11 @@ def import_folder(
     """
     folder, out = Path(folder), Path(out)
     said = read_recording_toml(folder / "recording.toml" if recording_toml is None else Path(recording_toml))
-    frames, names = _frames_in_world(folder, said)
+    frames, names, steps = _frames_in_world(folder, said)
     rest = frames[0]
     mesh = _declared_mesh(folder, said, rest)
     held = np.empty(0, int) if isinstance(said.grasp, GraspPath) else read_rows(folder, said.grasp, len(rest), "grasp")
+    _check_held(rest, held, names[0])
     truth = _truth(folder, said, rest, mesh)
     beside = truth_path(out)
     for path in (out, beside):
@@ -95,10 +92,10 @@ def import_folder(
     ) as writer:
         for number, (positions, name) in enumerate(zip(frames, names, strict=True)):
             unseen = ~np.isfinite(positions).all(axis=1)
-            if unseen.all() or (len(held) and unseen[held].all()):
+            if unseen.all() or (len(held) and not np.isfinite(positions[held] - rest[held]).all(axis=1).any()):
                 skipped.append((name, "no finite point" if unseen.all() else "no grasped point seen"))
                 continue
-            tool = _tool(said, number, positions, rest, held)
+            tool = _tool(said, steps[number], positions, rest, held)
             points = MeasuredPoints(positions=positions, track_id=np.arange(len(rest)), sd=said.noise_sd)
             writer.write(Observation(index=n_frames, time=number * said.period, tool=tool, points=points))
             n_frames, n_unseen = n_frames + 1, n_unseen + int(unseen.sum())
@@ -118,8 +115,8 @@ def import_folder(
     )
 
 
-def _frames_in_world(folder: Path, said: MeasuredRecording) -> tuple[Float[np.ndarray, "t n 3"], list[str]]:
-    """Frames in the world [m], the rest frame first and usable."""
+def _frames_in_world(folder: Path, said: MeasuredRecording) -> tuple[Float[np.ndarray, "t n 3"], list[str], list[int]]:
+    """Frames in the world [m], the rest frame first and usable; their names; how many frames after rest they lie."""
     frames, names = read_frames(folder, said.points)
     if said.points.rest >= len(frames):
         raise RecordingError(f"[points] rest is {said.points.rest}; there are {len(frames)} frames, counted from 0.")
@@ -129,21 +126,29 @@ def _frames_in_world(folder: Path, said: MeasuredRecording) -> tuple[Float[np.nd
     names = [names[number] for number in order]
     if np.isfinite(frames[0]).all(axis=1).sum() < 3:
         raise RecordingError(f"the rest frame {names[0]} has fewer than three finite points; choose another rest.")
-    return frames, names
+    return frames, names, [number - said.points.rest for number in order]
+
+
+def _check_held(rest: Float[np.ndarray, "n 3"], held: Int[np.ndarray, " h"], name: str) -> None:
+    if len(held) and not np.isfinite(rest[held]).all(axis=1).any():
+        raise RecordingError(
+            f"the rest frame {name} shows none of the {len(held)} grasped points, so where the tool began is unknown; "
+            "choose another rest, or state the path in [grasp]."
+        )
 
 
 def _tool(
     said: MeasuredRecording,
-    number: int,
+    step: int,
     positions: Float[np.ndarray, "n 3"],
     rest: Float[np.ndarray, "n 3"],
     held: Int[np.ndarray, " h"],
 ) -> ToolState:
     """The tip: on the stated path, or at the grasped points' mean at rest plus the mean motion of those seen."""
     if isinstance(said.grasp, GraspPath):
-        tip = said.grasp.start + number * said.grasp.step * said.grasp.direction
+        tip = said.grasp.start + step * said.grasp.step * said.grasp.direction
     else:
-        tip = rest[held].mean(axis=0) + np.nanmean(positions[held] - rest[held], axis=0)
+        tip = np.nanmean(rest[held], axis=0) + np.nanmean(positions[held] - rest[held], axis=0)
     return ToolState(
         position=tip,
         quat_wxyz=np.array([1.0, 0, 0, 0]),

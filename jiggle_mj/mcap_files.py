@@ -33,6 +33,11 @@ DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError
 """What reading a damaged record may raise: mcap's own errors, wrong sums, wrong lengths, broken compression."""
 
 
+def truth_path(recording: Path) -> Path:
+    """Where the truth of a recording goes: run.mcap, run.truth.mcap."""
+    return recording.with_suffix(".truth.mcap")
+
+
 class McapOutput:
     """Writes messages, metadata and arrays, with the caller's times only: the wall clock never enters the file.
 

@@ -32,7 +32,11 @@ class StereoPair:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredPoints:
-    """Points measured on the tissue, instead of images or beside them."""
+    """Points measured on the tissue.
+
+    Raises:
+        RecordingError: a standard deviation that is none.
+    """
 
     positions: Float[np.ndarray, "m 3"]
     """World [m]; NaN rows are points that were not seen."""
@@ -40,6 +44,11 @@ class MeasuredPoints:
     """The same number means the same material point in every frame; None for clouds without correspondence."""
     sd: float = 2e-4
     """Stated standard deviation of each coordinate [m]."""
+
+    def __post_init__(self) -> None:
+        """Check the noise."""
+        if not (np.isfinite(self.sd) and self.sd > 0):
+            raise RecordingError(f"the points' sd is {self.sd} m; it must be above 0 and finite.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +71,7 @@ class ToolState:
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """One moment: the tool, and images or measured points or both."""
+    """One moment: the tool, and images or measured points; where there are both, the estimator uses the images."""
 
     index: int
     """Position in the recording, skipped frames counted."""

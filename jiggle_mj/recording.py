@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jiggle_mj.camera import StereoCamera
@@ -235,7 +236,7 @@ class Recording:
             positions = positions @ T[:3, :3].T + T[:3, 3]
         known = {}
         if "sd" in columns and len(positions):
-            known["sd"] = float(columns["sd"][0])
+            known["sd"] = _one_sd(columns["sd"].astype(float))
         track = columns["track_id"].astype(np.int64) if "track_id" in columns else None
         return MeasuredPoints(positions=positions, track_id=track, **known)
 
@@ -272,6 +273,15 @@ def _read_camera(contents: RecordingContents) -> StereoCamera:
         right=parse_calibration(right, RIGHT_INFO),
         T_world_camera=T_world_left @ transform_of_rotation(calibration.R.T),
     )
+
+
+def _one_sd(stated: Float[np.ndarray, " m"]) -> float:
+    """The standard deviation that all points share."""
+    finite = stated[np.isfinite(stated)]
+    low, high = (finite.min(), finite.max()) if len(finite) else (np.nan, np.nan)
+    if high > low * (1 + 1e-6):
+        raise RecordingError(f"{POINTS} states sd from {low:g} to {high:g} m; all points of a cloud must share one.")
+    return float(low)
 
 
 def _points_message(time: int, points: MeasuredPoints) -> PointCloud:

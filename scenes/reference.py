@@ -21,6 +21,7 @@ from jiggle_mj.scenes.stereo import StereoRenderer, stereo_camera
 from jiggle_mj.scenes.tissue import TIMESTEP, build_tissue
 
 from jiggle_mj.camera import StereoCamera
+from jiggle_mj.errors import ActionError, SceneError
 from jiggle_mj.observation import Action, Declaration, Grasp, Move, Observation, Release, ToolState, Wait
 from jiggle_mj.truth import Truth, TruthFrame
 
@@ -29,14 +30,14 @@ SENSING: tuple[Sensing, ...] = get_args(Sensing)
 OPEN_ANGLE, CLOSED_ANGLE = 0.25, 0.0
 """Of each jaw [rad]."""
 WAIT_STEPS = 5
-"""Steps of a Wait: still frames are 0.1 s apart."""
+"""Steps of a Wait before the tissue may be found at rest: still frames are a little more than 0.1 s apart."""
 
 
 class Reference:
     """A tissue that can be grasped, lifted and watched.
 
     Raises:
-        SceneError: the scene is impossible.
+        SceneError: the scene is impossible, or the seed below 0.
         RenderError: `sensing="stereo"` and no offscreen OpenGL.
     """
 
@@ -50,6 +51,8 @@ class Reference:
     ) -> None:
         if sensing not in SENSING:
             raise ValueError(f"sensing = {sensing!r}: must be one of {', '.join(map(repr, SENSING))}.")
+        if seed < 0:
+            raise SceneError(f"seed = {seed}: must be an integer of at least 0.")
         self.scene, self.sensing = scene, sensing
         self._dump_dir = dump_dir
         self._tissue = build_tissue(scene, drawn=sensing == "stereo")
@@ -85,7 +88,7 @@ class Reference:
         """Carry out an action, let the tissue settle, and observe.
 
         Raises:
-            ValueError: a grasp off the tissue or while grasping, a release of nothing, numbers that are not finite.
+            ActionError: a grasp off the tissue or while grasping, a release of nothing, numbers that are not finite.
             SimulationError: the tissue became unstable.
         """
         match action:
@@ -154,21 +157,21 @@ class Reference:
 
     def _close(self, action: Grasp) -> None:
         if self._closed:
-            raise ValueError(f"grasp at {_text(action.point)} while grasp {self._grasp} still holds: release it first.")
+            raise ActionError(f"grasp at {_text(action.point)} while grasp {self._grasp} holds: release it first.")
         point = _finite(action.point, name="Grasp.point")
         if not (math.isfinite(action.radius) and action.radius > 0):
-            raise ValueError(f"Grasp.radius must be above 0 m; got {action.radius}.")
+            raise ActionError(f"Grasp.radius must be above 0 m; got {action.radius}.")
         vertices = self._surface()
         distance = np.linalg.norm(vertices - point, axis=1)
         inside = np.flatnonzero(distance <= action.radius)
         if not inside.size:
-            raise ValueError(
+            raise ActionError(
                 f"grasp at {_text(point)} m holds nothing: the nearest tissue is {1e3 * distance.min():.1f} mm away, "
                 f"the radius is {1e3 * action.radius:.1f} mm. Grasp closer or widen the radius."
             )
         inside = inside[np.isfinite(self._tissue.stiffness[inside])]
         if not inside.size:
-            raise ValueError(
+            raise ActionError(
                 f"grasp at {_text(point)} m meets welded vertices only, and a weld does not yield to the jaws. "
                 "Grasp elsewhere or widen the radius."
             )
@@ -183,7 +186,7 @@ class Reference:
 
     def _open(self) -> None:
         if not self._closed:
-            raise ValueError("release while nothing is held: grasp first.")
+            raise ActionError("release while nothing is held: grasp first.")
         self._data.eq_active[self._tissue.grips] = 0
         self._closed = False
         self._set_jaws(OPEN_ANGLE)
@@ -257,7 +260,7 @@ class Reference:
 def _finite(point: Float[np.ndarray, " 3"], *, name: str) -> Float[np.ndarray, " 3"]:
     values = np.array(point, dtype=float)
     if values.shape != (3,) or not np.isfinite(values).all():
-        raise ValueError(f"{name} must be three finite numbers in m; got {point}.")
+        raise ActionError(f"{name} must be three finite numbers in m; got {point}.")
     return values
 
 

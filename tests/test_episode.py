@@ -1,15 +1,18 @@
 """The loop and its files: the truth never reaches the estimate, the same seed gives the same bytes."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.scenes import Reference, load_scene, programme
 from tiny_scene import scene_file
 
-from jiggle_mj.episode import estimate, observe, prepare_directory
+from jiggle_mj.episode import clear_directory, estimate, observe, prepare_directory
 from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
-from jiggle_mj.importing import truth_path
-from jiggle_mj.observation import Wait
-from jiggle_mj.recording import Recording
+from jiggle_mj.mcap_files import truth_path
+from jiggle_mj.observation import Declaration, Wait
+from jiggle_mj.recording import Recording, RecordingWriter
 from jiggle_mj.truth_recording import read_truth
 
 
@@ -73,6 +76,33 @@ def test_frames_without_closed_jaws_cannot_be_estimated(tmp_path):
             estimate(frames, Estimator(reference.declaration))
 
 
+def test_frames_that_the_recording_skips_are_named_when_none_is_left(recording, tmp_path):
+    """A tool pose is NaN in every frame: that is the reason, not open jaws."""
+    _, seen = recording
+    path = tmp_path / "blind.mcap"
+    with RecordingWriter(path, camera=None, declaration=Declaration(), metadata={}) as writer:
+        for one in seen[:4]:
+            writer.write(replace(one, tool=replace(one.tool, position=np.full(3, np.nan))))
+    opened = Recording.open(path)
+    with pytest.raises(PerceptionError, match="frame 0: NaN"):
+        estimate(opened, Estimator(opened.declaration))
+
+
+def test_frames_skipped_by_recording_and_estimator_are_counted_together(recording, tmp_path):
+    _, seen = recording
+    first = next(one for one in seen if one.tool.closed)
+    lost = replace(first, index=first.index + 1, tool=replace(first.tool, position=np.full(3, np.nan)))
+    nowhere = replace(first.points, positions=np.full_like(first.points.positions, np.nan))
+    hidden = replace(seen[lost.index + 1], points=nowhere)
+    with RecordingWriter(tmp_path / "gaps.mcap", camera=None, declaration=Declaration(), metadata={}) as writer:
+        for one in (*seen[: lost.index], replace(lost, time=seen[lost.index].time), hidden):
+            writer.write(one)
+    opened = Recording.open(tmp_path / "gaps.mcap")
+    episode = estimate(opened, Estimator(opened.declaration))
+    assert [index for index, _ in episode.skipped] == [lost.index, hidden.index]
+    assert (episode.n_frames, len(episode.estimates)) == (hidden.index + 1, 1)
+
+
 def test_a_folder_with_results_is_kept_unless_overwriting_is_allowed(tmp_path):
     for name in ("run.mcap", "mine.txt"):
         (tmp_path / name).write_text("kept")
@@ -80,6 +110,8 @@ def test_a_folder_with_results_is_kept_unless_overwriting_is_allowed(tmp_path):
         prepare_directory(tmp_path, ["run.mcap"], overwrite=False)
     assert (tmp_path / "run.mcap").read_text() == "kept"
     prepare_directory(tmp_path, ["run.mcap"], overwrite=True)
+    assert (tmp_path / "run.mcap").exists()
+    clear_directory(tmp_path, ["run.mcap"])
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 

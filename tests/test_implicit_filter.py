@@ -28,6 +28,15 @@ def information(implicit: ImplicitFilter, x, b, evidence: Evidence):
     return implicit._information(frame, b, implicit._residual(frame)[1])
 
 
+@eqx.filter_jit
+def normalised_innovation(implicit: ImplicitFilter, x, b, evidence: Evidence, belief: BoundaryBelief):
+    frame = implicit._linearise(x, b, evidence)
+    residual, whitened = implicit._residual(frame)
+    gained, shift = implicit._information(frame, b, whitened)
+    after = jnp.linalg.cholesky(belief.add(gained, shift).precision)
+    return implicit._normalised_innovation(frame, residual, whitened, gained, belief.mean() - b, after, evidence)
+
+
 @pytest.fixture(scope="module")
 def implicit() -> ImplicitFilter:
     return ImplicitFilter.build(sheet(), sheet_energy(), force_sd=FORCE_SD, grip_stiffness=3 * K)
@@ -94,7 +103,8 @@ def test_the_state_is_closer_to_the_truth_than_what_was_seen(implicit):
 
 
 def test_information_equals_the_dense_formula(implicit):
-    """D^T (tau^2 I + H R H)^-1 D over particles that are not held, and the shift D^T N^-1 (D b - g - H (y - x))."""
+    """D^T (tau^2 I + H R H)^-1 D over particles that are not held, the shift D^T N^-1 (D b - g - H (y - x)), and
+    the innovation at the mean of a belief, squared against N + D Sigma D^T."""
     frame = lifts()[3]
     seen = evidence(frame, 1)
     b = jnp.asarray(np.random.default_rng(0).uniform(0, 1, sheet().n))
@@ -118,6 +128,12 @@ def test_information_equals_the_dense_formula(implicit):
     residual = (g + H @ (np.asarray(seen.y) - frame.x).ravel())[free]
     expected_shift = expected @ np.asarray(b) - D.T @ np.linalg.solve(N, residual)
     np.testing.assert_allclose(shift, expected_shift, atol=1e-6 * np.abs(expected_shift).max())
+
+    belief = BoundaryBelief.prior(n, mean=0.2, sd=PRIOR_SD)
+    innovation = residual + D @ (0.2 - np.asarray(b))
+    squared = innovation @ np.linalg.solve(N + PRIOR_SD**2 * D @ D.T, innovation)
+    nis = normalised_innovation(implicit, jnp.asarray(frame.x), b, seen, belief)
+    np.testing.assert_allclose(nis, squared / (3 * n - 3 * frame.held.sum()), rtol=1e-6)
 
 
 def test_a_missing_particle_has_no_influence(implicit):

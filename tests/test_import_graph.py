@@ -184,6 +184,10 @@ def test_importing_the_estimator_leaves_mujoco_out():
     assert "mujoco" not in loaded_by("import " + ", ".join(names))
 
 
+def test_estimating_from_a_recording_leaves_mujoco_out():
+    assert "mujoco" not in loaded_by("from jiggle_mj.eval.experiment import run_estimator, score_directory")
+
+
 def test_importing_the_scenes_leaves_jax_out():
     names = [name for name in modules(ROOT) if name.startswith("jiggle_mj.scenes")]
     assert "jax" not in loaded_by("import " + ", ".join(names))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jiggle_mj.errors import MeshError, OutputError, RecordingError
-from jiggle_mj.importing import ImportSummary, import_folder, truth_path
+from jiggle_mj.importing import ImportSummary, import_folder
+from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.recording import Recording
 from jiggle_mj.sheet_triangulation import SheetPlane, extend, triangulate
@@ -15,7 +16,7 @@ from jiggle_mj.truth_recording import read_truth
 
 CHECKOUT = Path(__file__).parents[1]
 DOCUMENTED = CHECKOUT / "docs" / "recordings"
-MEASURED = Path(os.environ.get("JIGGLE_MJ_MEASURED", CHECKOUT.parent / "shared" / "measured"))
+MEASURED = os.environ.get("JIGGLE_MJ_MEASURED")
 ROUNDING = 1e-15
 """Coordinates of a few cm in metres, once scaled and turned."""
 
@@ -127,6 +128,29 @@ def test_the_frame_is_turned_after_the_unit_and_the_rest_comes_first(tmp_path):
         first.points.positions, np.column_stack([-given[:, 1], given[:, 0] + 1, given[:, 2]]), atol=ROUNDING
     )
     np.testing.assert_allclose(second.points.positions[0], [0, 1, 5e-3], atol=ROUNDING)
+
+
+def test_a_stated_path_counts_its_steps_from_the_rest_frame_wherever_that_stands(tmp_path):
+    path = "start = [0.0, 0.0, 0.0]\ndirection = [0.0, 0.0, 1.0]\nstep = 1e-3"
+    toml = TOML.replace("rows = [0, 1]", path, 1).replace('"]\n[grasp]', '"]\nrest = 1\n[grasp]')
+    _, recording = bring_in(folder(tmp_path, toml=toml))
+    assert [round(1e3 * frame.tool.position[2]) for frame in recording] == [0, -1, 1]
+    assert [frame.points.positions[0, 2] for frame in recording] == pytest.approx([8e-3, 5e-3, 9e-3])
+
+
+def test_a_grasped_point_unseen_at_rest_leaves_the_tool_to_the_others(tmp_path):
+    rest = grid()
+    rest[0] = np.nan
+    summary, recording = bring_in(folder(tmp_path, frames=[rest, grid(), grid() + 1]))
+    np.testing.assert_allclose([frame.tool.position for frame in recording], 1e-3 * (grid()[1] + [[0], [0], [1]]))
+    assert not summary.skipped
+
+
+def test_a_rest_frame_without_any_grasped_point_is_refused(tmp_path):
+    rest = grid()
+    rest[:2] = np.nan
+    with pytest.raises(RecordingError, match=r"rest\.xyz shows none of the 2 grasped points.*another rest"):
+        bring_in(folder(tmp_path, frames=[rest, grid(), grid() + 1]))
 
 
 def test_unseen_points_are_nan_and_the_tool_follows_the_grasped_points_that_are_seen(tmp_path):
@@ -359,9 +383,9 @@ def test_a_good_mesh_passes_and_each_fault_is_named():
 
 
 def measured(name: str) -> Path:
-    if not (MEASURED / name).is_dir():
-        pytest.skip(f"{MEASURED / name} is not here; measured data is not part of the project (JIGGLE_MJ_MEASURED)")
-    return MEASURED / name
+    if MEASURED is None:
+        pytest.skip("measured data is not part of the project; JIGGLE_MJ_MEASURED names the folder that holds it")
+    return Path(MEASURED) / name
 
 
 def test_the_documented_chicken_skin_is_imported(tmp_path):

@@ -35,7 +35,7 @@ def flat():
     """The flat sheet's pair, tissue and mesh."""
     pair = stereo(PlaneSheet())
     tissue = largest_blob(WarmTissue()(pair.left), smallest=100)
-    mesh = lay_mesh(tissue, SemiGlobalMatching()(pair.left, pair.right), camera(), spacing=SPACING)
+    mesh = lay_mesh(tissue, SemiGlobalMatching(largest=64)(pair.left, pair.right), camera(), spacing=SPACING)
     return pair, tissue, mesh
 
 
@@ -80,14 +80,23 @@ def test_the_largest_blob_drops_flecks_and_refuses_a_second_sheet():
 def test_semi_global_matching_finds_the_plane_and_nothing_in_swapped_images():
     """d = f B / Z within 0.3 px (it locks to whole pixels); swapped, under 20 % pass, which `start` refuses."""
     pair = stereo(TILTED)
-    disparity = SemiGlobalMatching()(pair.left, pair.right)
+    disparity = SemiGlobalMatching(largest=64)(pair.left, pair.right)
     tissue = WarmTissue()(pair.left)
     v, u = np.nonzero(tissue & np.isfinite(disparity))
     assert len(u) > 0.9 * tissue.sum()
     points = camera().back_project(np.stack([u, v, disparity[v, u]], axis=-1).astype(float))
     off_plane = (points - TILTED.centre) @ np.cross(TILTED.along, TILTED.across)
     assert np.median(np.abs(off_plane)) < 0.3 * 0.1**2 / (FOCAL * BASELINE)
-    assert np.isfinite(SemiGlobalMatching()(pair.right, pair.left)[tissue]).mean() < 0.2
+    assert np.isfinite(SemiGlobalMatching(largest=64)(pair.right, pair.left)[tissue]).mean() < 0.2
+
+
+def test_the_search_range_follows_from_the_calibration():
+    """f B / 30 mm: 420 px x 5 mm / 30 mm = 70, so 80; four times the baseline asks for 280 of 400 px and gets half."""
+    assert SemiGlobalMatching.for_camera(camera()).largest == 80
+    P = camera().right.P.copy()
+    P[0, 3] *= 4
+    wide = replace(camera(), right=replace(camera().right, P=P))
+    assert SemiGlobalMatching.for_camera(wide).largest == 208
 
 
 def test_the_mesh_covers_the_sheet_with_good_triangles(flat):
@@ -127,7 +136,7 @@ def test_too_little_disparity_is_refused():
 def test_a_sheet_of_few_particles_is_refused(flat):
     pair, tissue, _ = flat
     with pytest.raises(PerceptionError, match="particles at a spacing"):
-        lay_mesh(tissue, SemiGlobalMatching()(pair.left, pair.right), camera(), spacing=0.02)
+        lay_mesh(tissue, SemiGlobalMatching(largest=64)(pair.left, pair.right), camera(), spacing=0.02)
 
 
 def test_two_blobs_joined_by_a_thread_are_refused(flat):
@@ -261,6 +270,6 @@ def test_settings_out_of_range_are_refused():
     with pytest.raises(ValueError, match="multiple of 16"):
         SemiGlobalMatching(largest=50)
     with pytest.raises(ValueError, match="odd"):
-        SemiGlobalMatching(block=4)
+        SemiGlobalMatching(largest=64, block=4)
     with pytest.raises(ValueError, match="redness"):
         WarmTissue(redness=0)

@@ -401,6 +401,30 @@ def test_cameras_of_two_sizes_are_refused(tmp_path):
         Recording.open(bag.output.path)
 
 
+def test_cameras_whose_rectified_intrinsics_differ_are_refused():
+    good = camera()
+    for row, column in ((0, 0), (0, 2), (1, 2)):
+        P = good.right.P.copy()
+        P[row, column] += 20
+        with pytest.raises(RecordingError, match="rectified cameras differ"):
+            StereoCamera(left=good.left, right=replace(good.right, P=P), T_world_camera=np.eye(4))
+
+
+def test_the_noise_of_points_is_that_of_those_seen_and_must_be_one_positive_number(tmp_path):
+    """The first point's is NaN; then none is stated above 0; then two differ."""
+    xyz = dict(zip("xyz", np.random.default_rng(0).normal(size=(3, 4)), strict=True))
+    bag = Bag(tmp_path / "noise.mcap")
+    for number, sd in enumerate(([np.nan, 1e-3, 1e-3, 1e-3], [0.0] * 4, [1e-3, 2e-3, 1e-3, 1e-3])):
+        bag.tool(number * MS)
+        bag.output.message(POINTS, number * MS, point_cloud(number * MS, xyz | {"sd": np.array(sd)}))
+    bag.output.close()
+    recording = Recording.open(tmp_path / "noise.mcap")
+    (kept,) = recording
+    assert kept.points.sd == 1e-3
+    (_, nothing), (_, two) = recording.skipped
+    assert "sd is 0.0 m; it must be above 0" in nothing and "from 0.001 to 0.002" in two
+
+
 def test_a_camera_that_moves_or_is_nowhere_is_refused(tmp_path):
     moved = replace(camera(), T_world_camera=np.eye(4))
     for name, message in (("moving", "moves on /tf"), ("nowhere", "does not lead from 'world'")):

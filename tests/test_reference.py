@@ -12,7 +12,7 @@ from jiggle_mj.scenes import Reference, Scene, programme, simulation
 from jiggle_mj.scenes.attachments import Disc
 from jiggle_mj.scenes.scene import Bed, Programme, Tissue, Tweezer
 
-from jiggle_mj.errors import SimulationError
+from jiggle_mj.errors import ActionError, SceneError, SimulationError
 from jiggle_mj.observation import Grasp, Move, Release, Wait
 
 TISSUE = Tissue(size=(0.06, 0.06), spacing=6e-3)
@@ -144,7 +144,7 @@ def test_welded_vertices_slip_out_of_the_jaws_and_a_grasp_of_nothing_else_is_ref
     weld = dataclasses.replace(MIDDLE, stiffness=math.inf)
     scene = dataclasses.replace(SCENE, attachments=(weld,))
     point = np.array([0.0, 0.0, 4e-4])
-    with pytest.raises(ValueError, match="meets welded vertices only"):
+    with pytest.raises(ActionError, match="meets welded vertices only"):
         particles(scene).step(Grasp(point=point, radius=5e-3))
     reference = particles(scene)
     reference.step(Grasp(point=point, radius=0.018))
@@ -223,22 +223,22 @@ def test_the_truths_details_are_json_even_with_welds():
 
 
 def test_a_grasp_off_the_tissue_is_refused_and_says_how_far_off():
-    with pytest.raises(ValueError, match=r"holds nothing: the nearest tissue is 2[0-9]\.[0-9] mm away"):
+    with pytest.raises(ActionError, match=r"holds nothing: the nearest tissue is 2[0-9]\.[0-9] mm away"):
         particles().step(Grasp(point=np.array([0.05, 0.0, 0.0]), radius=5e-3))
 
 
 def test_a_second_grasp_and_an_idle_release_are_refused():
     reference = particles()
-    with pytest.raises(ValueError, match="nothing is held"):
+    with pytest.raises(ActionError, match="nothing is held"):
         reference.step(Release())
     reference.step(Grasp(point=CORNER, radius=8e-3))
-    with pytest.raises(ValueError, match="grasp 1 still holds"):
+    with pytest.raises(ActionError, match="grasp 1 holds"):
         reference.step(Grasp(point=-CORNER, radius=8e-3))
 
 
 @pytest.mark.parametrize("action", [Move(to=np.array([0.0, np.nan, 0.0])), Grasp(point=CORNER, radius=-1.0)])
 def test_actions_with_impossible_numbers_are_refused(action):
-    with pytest.raises(ValueError, match="must be"):
+    with pytest.raises(ActionError, match="must be"):
         particles().step(action)
 
 
@@ -273,3 +273,8 @@ def test_the_tweezer_touches_nothing_and_its_jaws_close():
     narrow = [data.qpos[model.jnt_qposadr[j]] for j in reference._tissue.jaws]
     assert tool and not tool & set(data.contact.geom.ravel().tolist())
     assert min(wide) > 0.2 and max(np.abs(narrow)) < 0.02
+
+
+def test_a_seed_below_zero_is_refused():
+    with pytest.raises(SceneError, match="seed = -1: must be an integer of at least 0"):
+        Reference(Scene(name="small", tissue=TISSUE), seed=-1, sensing="particles")

@@ -2,10 +2,12 @@
 
 import json
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
-from jiggle_mj.eval.score import read_result, result, score, with_truth, write_result
+from jiggle_mj.eval.score import RECORDED, read_result, result, score, with_truth, write_result
+from result_keys import KEYS, keys
 
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
@@ -64,6 +66,7 @@ def unscored() -> dict:
         estimates=ESTIMATES,
         detection=DETECTION,
         prior_entropy=9.0,
+        n_frames=5,
         skipped=[(1, "NaN in the pose")],
     )
 
@@ -73,39 +76,16 @@ def scored(**changes) -> dict:
     return with_truth(unscored(), **(parts | changes))
 
 
-def keys(value: object) -> object:
-    """The tree of keys of nested dictionaries."""
-    return {name: keys(inner) for name, inner in value.items()} if isinstance(value, dict) else None
-
-
 def test_the_keys_are_those_of_the_contract_scored_or_not():
     """As the result file is documented, with `procedure` only where there is one; scoring adds and drops none."""
-    rings = {ring: dict.fromkeys(("pcd", "pug", "f1")) for ring in ("0", "1", "2")}
-    contract = {
-        **dict.fromkeys(("scene", "seed", "sensing", "estimator", "policy", "n_particles", "n_frames")),
-        "detection": {
-            **dict.fromkeys(("rule", "n_detected", "n_attached", "n_observable", "average_precision")),
-            "by_dilation": rings,
-            "observable": {"by_dilation": rings},
-        },
-        "calibration": dict.fromkeys(("nees_per_dof", "coverage_90", "ece")),
-        "tracking": {"rms_m": None},
-        "safety": dict.fromkeys(("limit_j", "max_mean_boundary_energy_j", "violations")),
-        "entropy": dict.fromkeys(("prior", "final")),
-        "frames": dict.fromkeys(("used", "skipped")),
-        "timing": {
-            "update_s": dict.fromkeys(("median", "p95")),
-            **dict.fromkeys(("perception_s", "plan_s", "simulation_s")),
-        },
-    }
-    assert keys(unscored()) == contract
-    assert keys(scored()) == contract
+    assert keys(unscored()) == KEYS
+    assert keys(scored()) == KEYS
 
 
 def test_the_estimators_own_figures_by_hand():
-    """Two used frames of 0.1 and 0.3 s and one skipped: median 0.2 s, 95th percentile 0.1 + 0.95 * 0.2 s."""
+    """Five frames, two used, in 0.1 and 0.3 s, and one skipped: median 0.2 s, 95th percentile 0.1 + 0.95 * 0.2 s."""
     figures = unscored()
-    assert (figures["n_particles"], figures["n_frames"], figures["frames"]["used"]) == (6, 3, 2)
+    assert (figures["n_particles"], figures["n_frames"], figures["frames"]["used"]) == (6, 5, 2)
     assert figures["frames"]["skipped"] == [{"index": 1, "why": "NaN in the pose"}]
     assert figures["timing"]["update_s"] == pytest.approx({"median": 0.2, "p95": 0.29})
     assert figures["entropy"] == {"prior": 9.0, "final": 3.0}
@@ -143,10 +123,10 @@ def test_a_tissue_without_attachments_has_no_recall_but_counts_reports():
     assert (figures["n_detected"], figures["by_dilation"]["0"]) == (0, {"pcd": None, "pug": None, "f1": None})
 
 
-def written(folder):
+def written(folder, settings=MappingProxyType({})):
     """A folder as `estimate` leaves it, and the truth beside it."""
     write_result(folder / "result.json", unscored())
-    with EstimateWriter(folder / "estimate.mcap", SHEET, {}) as writer:
+    with EstimateWriter(folder / "estimate.mcap", SHEET, {RECORDED: "by hand", **settings}) as writer:
         for one in ESTIMATES:
             writer.write(one)
         writer.finish(BELIEF, DETECTION, skipped=[(1, "NaN in the pose")])
@@ -170,6 +150,9 @@ def test_a_folder_that_cannot_be_scored_is_refused_with_what_to_do(tmp_path):
     write_truth(folder / "other.truth.mcap", other)
     with pytest.raises(RecordingError, match="truth of the same recording"):
         score(folder, folder / "other.truth.mcap")
+    write_truth(folder / "line.truth.mcap", replace(TRUTH, scene="line"))
+    with pytest.raises(RecordingError, match=r"truth of 'line', and .* the estimate of 'by hand'"):
+        score(folder, folder / "line.truth.mcap")
     (folder / "estimate.mcap").unlink()
     with EstimateWriter(folder / "estimate.mcap", SHEET, {}) as writer:
         writer.write(ESTIMATES[0])

@@ -125,9 +125,10 @@ class ImplicitFilter(eqx.Module):
         """
         frame = self._approach(self._settle(start, b, evidence), b, evidence)
         residual, whitened = self._residual(frame)
-        belief = belief.add(*self._information(frame, b, whitened))
+        gained, shift = self._information(frame, b, whitened)
+        ahead, belief = belief.mean() - b, belief.add(gained, shift)
         factor = jnp.linalg.cholesky(belief.precision)
-        nis = self._normalised_innovation(frame, residual, whitened, factor, evidence)
+        nis = self._normalised_innovation(frame, residual, whitened, gained, ahead, factor, evidence)
         b = belief.non_negative_mean(b > 0)
         x = self._polish(frame, b, evidence)
         return Update(belief=belief, x=x, b=b, nis=nis, sd=standard_deviations(factor), entropy=entropy(factor))
@@ -253,19 +254,24 @@ class ImplicitFilter(eqx.Module):
         frame: "_Frame",
         residual: Float[Array, "n 3"],
         whitened: Float[Array, "n 3"],
+        gained: Float[Array, "n n"],
+        ahead: Float[Array, " n"],
         posterior: Float[Array, "n n"],
         evidence: Evidence,
     ) -> Float[Array, ""]:
-        """e^T (N + D Sigma D^T)^-1 e per degree of freedom, with e and Sigma from before the frame.
+        """e^T (N + D Sigma D^T)^-1 e per degree of freedom, with Sigma from before the frame and e at the mean then.
 
-        `posterior` is the Cholesky factor of the precision after it. By Woodbury's identity
+        That mean lies `ahead` of the b that `residual` is for, so e = residual + D ahead. `posterior` is the Cholesky
+        factor of the precision after the frame. By Woodbury's identity
         e^T N^-1 e - s^T (Sigma^-1 + D^T N^-1 D)^-1 s with s = D^T N^-1 e.
         """
-        s = jnp.sum(frame.d * whitened, axis=1)
+        at_b = jnp.sum(frame.d * whitened, axis=1)
+        squared = jnp.sum(residual * whitened) + ahead @ (2 * at_b + gained @ ahead)
+        s = at_b + gained @ ahead
         explained = s @ cho_solve((posterior, True), s)
         observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
         degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.loaded), 1)
-        return (jnp.sum(residual * whitened) - explained) / degrees.astype(s.dtype)
+        return (squared - explained) / degrees.astype(s.dtype)
 
     def _apply(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """H v."""

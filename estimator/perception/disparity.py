@@ -5,12 +5,18 @@ left to right and right to left; what the two do not agree on is unknown. It loc
 `lucas_kanade` refines it where it matters. A learned model plugs in through `Disparity`.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+
+from jiggle_mj.camera import StereoCamera
+
+NEAREST = 0.03
+"""Distance from the camera within which no tissue is expected [m]."""
 
 
 @runtime_checkable
@@ -28,12 +34,18 @@ class Disparity(Protocol):
 class SemiGlobalMatching:
     """Semi-global block matching with a left-right check."""
 
-    largest: int = 64
+    largest: int
     """Search range [px], a multiple of 16."""
     block: int = 5
     """Block size [px], odd."""
     tolerance: float = 1.5
     """Largest disagreement between the two directions [px]."""
+
+    @classmethod
+    def for_camera(cls, camera: StereoCamera) -> "SemiGlobalMatching":
+        """With the range that a tissue at the nearest distance needs, at most half of the image's width."""
+        needed = min(camera.focal[0] * camera.baseline / NEAREST, camera.left.width / 2)
+        return cls(largest=16 * math.ceil(needed / 16))
 
     def __post_init__(self) -> None:
         """Check the ranges."""

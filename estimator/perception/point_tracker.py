@@ -4,6 +4,8 @@ The estimator triangulates the points anew, unless a mesh is declared. Clouds wi
 the nearest surface instead of the same material point loses the attachments.
 """
 
+from collections import Counter
+
 import numpy as np
 from jaxtyping import Float
 from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
@@ -17,6 +19,8 @@ LONGEST_EDGE = 2.5
 """Triangles with a longer edge are no tissue [medians of all edges]."""
 FEWEST = 20
 """Fewest points that make a sheet."""
+OFTEN = 0.5
+"""Share of the frames at rest in which a point must be seen to become a particle."""
 
 
 class PointTracker:
@@ -28,21 +32,24 @@ class PointTracker:
         """Track id of each particle, -1 where nothing is measured."""
 
     def start(self, still: list[MeasuredPoints]) -> Sheet:
-        """Lay the mesh over the mean of one or more frames at rest; points far from all others are left out.
+        """Lay the mesh over the mean of one or more frames at rest; stray points and rarely seen ones are left out.
 
         Raises:
             PerceptionError: points without identities, or too few of them.
         """
         found = [_by_id(points) for points in still]
-        ids = sorted(set.intersection(*(set(frame) for frame in found)))
         if self._declared is not None:
             self.ids = self._declared.track_id
             rest_variance = np.full(len(self.ids), still[0].sd ** 2)
             sheet = Sheet(rest=self._declared.vertices, faces=self._declared.faces)
         else:
+            times = Counter(i for frame in found for i in frame)
+            ids = sorted(i for i, count in times.items() if count >= OFTEN * len(still))
             if len(ids) < FEWEST:
-                raise PerceptionError(f"{len(ids)} points are seen in every frame at rest; a sheet needs {FEWEST}.")
-            rest = np.mean([[frame[i] for i in ids] for frame in found], axis=0)
+                raise PerceptionError(
+                    f"{len(ids)} points are seen in half of the {len(still)} frames at rest; a sheet needs {FEWEST}."
+                )
+            rest = np.array([np.mean([frame[i] for frame in found if i in frame], axis=0) for i in ids])
             self.ids = np.asarray(ids)
             flat = SheetPlane.through(rest).flatten(rest)
             edges = triangulate(flat, np.inf)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
@@ -51,7 +58,7 @@ class PointTracker:
             used, faces = np.unique(faces, return_inverse=True)
             self.ids = self.ids[used]
             sheet = Sheet(rest=rest[used], faces=faces.reshape(-1, 3))
-            rest_variance = np.full(len(used), still[0].sd ** 2 / len(still))
+            rest_variance = still[0].sd ** 2 / np.array([times[i] for i in self.ids.tolist()])
         self._rest_variance: Float[np.ndarray, " n"] = rest_variance
         return sheet
 

@@ -152,7 +152,7 @@ def surface_through(
     if share < LEAST_MATCHED:
         raise PerceptionError(
             f"only {share:.0%} of the tissue has a positive disparity, at least {LEAST_MATCHED:.0%} is needed: are the "
-            "left and right cameras swapped, the pair not rectified, or the tissue without texture?"
+            "left and right cameras swapped, the pair not rectified, the tissue without texture, or too near?"
         )
     pick = slice(None, None, max(1, len(rows) // MOST_SAMPLES))
     pixels = np.stack([columns[pick], rows[pick]], axis=-1).astype(float)

@@ -93,13 +93,13 @@ class StereoTracker:
             camera: the calibrated pair.
             spacing: distance between neighbouring particles [m].
             mask: which pixels are tissue; `WarmTissue()` by default.
-            disparity: dense disparity; `SemiGlobalMatching()` by default.
+            disparity: dense disparity; `SemiGlobalMatching.for_camera` by default.
         """
         if not spacing > 0:
             raise ValueError(f"StereoTracker.spacing must be above 0 m; got {spacing}.")
         self._camera, self._spacing = camera, spacing
         self._mask = WarmTissue() if mask is None else mask
-        self._disparity = SemiGlobalMatching() if disparity is None else disparity
+        self._disparity = SemiGlobalMatching.for_camera(camera) if disparity is None else disparity
         self._rectify = Rectifier(camera)
         self._last: _Last | None = None
 

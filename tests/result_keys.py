@@ -1,0 +1,25 @@
+"""The keys of `result.json`, as its contract has them."""
+
+BY_DILATION = {rings: dict.fromkeys(("pcd", "pug", "f1")) for rings in "012"}
+KEYS = {
+    **dict.fromkeys(("scene", "seed", "sensing", "estimator", "policy", "n_particles", "n_frames")),
+    "detection": {
+        **dict.fromkeys(("rule", "n_detected", "n_attached", "n_observable", "average_precision")),
+        "by_dilation": BY_DILATION,
+        "observable": {"by_dilation": BY_DILATION},
+    },
+    "calibration": dict.fromkeys(("nees_per_dof", "coverage_90", "ece")),
+    "tracking": {"rms_m": None},
+    "safety": dict.fromkeys(("limit_j", "max_mean_boundary_energy_j", "violations")),
+    "entropy": dict.fromkeys(("prior", "final")),
+    "frames": dict.fromkeys(("used", "skipped")),
+    "timing": {
+        "update_s": dict.fromkeys(("median", "p95")),
+        **dict.fromkeys(("perception_s", "plan_s", "simulation_s")),
+    },
+}
+
+
+def keys(value: object) -> object:
+    """The tree of keys of nested dictionaries."""
+    return {name: keys(inner) for name, inner in value.items()} if isinstance(value, dict) else None
