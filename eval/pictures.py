@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from jiggle_mj.estimator.perception.rectified import rectifying_maps
 
 from jiggle_mj.camera import CameraCalibration, StereoCamera
 from jiggle_mj.estimate import Estimate
@@ -95,12 +96,9 @@ def _picture(
 def _data_uri(
     image: UInt8[np.ndarray, "height width 3"], calibration: CameraCalibration, scale: float
 ) -> tuple[str, tuple[int, int]]:
-    if not calibration.rectified:
-        size = (calibration.width, calibration.height)
-        maps = cv2.initUndistortRectifyMap(
-            calibration.K, calibration.D, calibration.R, calibration.P[:, :3], size, cv2.CV_32FC1
-        )
-        image = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR)
+    maps = rectifying_maps(calibration)
+    if maps is not None:
+        image = cv2.remap(image, *maps, cv2.INTER_LINEAR)
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     encoded, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])

@@ -4,7 +4,8 @@
 fills that in; `score` does it for a folder on disk. Fractions, not per cent; null where undefined.
 
 Not judged yet, and null: which attachments the pulls could show (`n_observable`, `observable`), the limit on the
-boundary energy and its violations, and the expected calibration error, since no rule states probabilities.
+boundary energy and its violations, the time of planning, and the expected calibration error, since no rule states
+probabilities.
 """
 
 import copy
@@ -43,7 +44,6 @@ def result(
     prior_entropy: float | None,
     n_frames: int,
     skipped: Sequence[tuple[int, str]] = (),
-    plan_s: float | None = None,
     simulation_s: float | None = None,
 ) -> Json:
     """All keys of `result.json`, before any truth is seen.
@@ -60,7 +60,6 @@ def result(
         prior_entropy: of the belief before any frame [nat]; None if not known.
         n_frames: of the recording: used, skipped and those with open jaws.
         skipped: index and reason of each frame that was left out.
-        plan_s: median wall time of choosing one pull [s]; None where nothing was planned.
         simulation_s: wall time of the reference tissue, all frames [s]; None for a recording.
     """
     update = np.array([estimate.update_s for estimate in estimates])
@@ -96,7 +95,7 @@ def result(
                 "p95": float(np.percentile(update, 95)) if len(update) else None,
             },
             "perception_s": float(np.median(perception)) if len(perception) else None,
-            "plan_s": _number(plan_s),
+            "plan_s": None,
             "simulation_s": _number(simulation_s),
         },
     }

@@ -112,7 +112,7 @@ class Declaration:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """[m/s^2], world; zeros where nobody knows which way is down."""
     bed: bool = True
-    """Whether the tissue lies on a bed at rest, which it cannot pass."""
+    """Whether the tissue lies on a bed at rest, which it cannot pass; without gravity there is none."""
     mesh: DeclaredMesh | None = None
 
     def __post_init__(self) -> None:

@@ -42,8 +42,10 @@ def parse_declaration(text: str) -> Declaration:
     """
     try:
         values = json.loads(text)
-        return Declaration(**(values | {"gravity": tuple(values["gravity"])}))
-    except (TypeError, KeyError, ValueError) as failure:
+        if "gravity" in values:
+            values["gravity"] = tuple(values["gravity"])
+        return Declaration(**values)
+    except (TypeError, ValueError) as failure:
         raise RecordingError(f"the recording's declaration cannot be read ({failure}): {text[:120]}") from failure
 
 

@@ -162,7 +162,7 @@ class Scene:
 
     name: str
     seed: int = 0
-    """Added to the seed of a run, so that two scenes never share their noise."""
+    """With the seed of a run it draws the sensing noise, so that two scenes never share theirs."""
     tissue: Tissue = field(default_factory=Tissue)
     bed: Bed = field(default_factory=Bed)
     attachments: tuple[Attachment, ...] = ()

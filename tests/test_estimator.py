@@ -8,7 +8,7 @@ from jiggle_mj.estimator import Estimator, EstimatorConfig
 from perception_plane import camera
 from small_sheet import DECLARATION, GRIP_RADIUS, SPACING, attached, lifts, sheet
 
-from jiggle_mj.errors import PerceptionError, RecordingError
+from jiggle_mj.errors import MeshError, PerceptionError, RecordingError
 from jiggle_mj.observation import MeasuredPoints, Observation, StereoPair, ToolState
 
 NOISE = 5e-5
@@ -125,6 +125,14 @@ def test_a_cloud_without_identities_is_refused():
             estimator.update(with_points(one, track_id=None))
 
 
+def test_two_sheets_of_points_are_refused():
+    apart = np.where(sheet().rest[:, :1] > 0, 0.03, 0.0) * np.array([1.0, 0, 0])
+    estimator = Estimator(DECLARATION)
+    with pytest.raises(MeshError, match="2 disconnected sheets"):
+        for one in episode()[:3]:
+            estimator.update(with_points(one, positions=one.points.positions + apart))
+
+
 def test_too_few_points_are_refused():
     estimator = Estimator(DECLARATION)
     with pytest.raises(PerceptionError, match="10 points are seen in half of the 2 frames at rest; a sheet needs 20"):
@@ -145,7 +153,7 @@ def test_points_that_drop_out_now_and_then_are_particles_still():
 
 
 def test_a_grasp_whose_first_frame_is_lost_still_knows_where_the_jaws_closed():
-    """The frame of closing shows nothing; in the next the hidden corner is 5 mm up, and is believed nearer to there than to rest."""
+    """Nothing is seen of the closing; the hidden corner, 5 mm up in the next frame, is believed nearer there."""
     frames = episode()
     lost = with_points(frames[2], positions=np.full((sheet().n, 3), np.nan))
     held = lifts()[1].held

@@ -90,6 +90,16 @@ def test_semi_global_matching_finds_the_plane_and_nothing_in_swapped_images():
     assert np.isfinite(SemiGlobalMatching(largest=64)(pair.right, pair.left)[tissue]).mean() < 0.2
 
 
+def test_triangles_that_hang_together_by_nothing_are_refused(flat):
+    """The contour is one piece, but its neck is one particle wide: triangles on both sides, none across."""
+    _, tissue, _ = flat
+    neck = tissue.copy()
+    neck[:, 170:230] = False
+    neck[144:156, 170:230] = True
+    with pytest.raises(PerceptionError, match="mesh falls into 2 pieces"):
+        lay_mesh(neck, np.full(tissue.shape, 19.0, np.float32), camera(), spacing=SPACING)
+
+
 def test_the_search_range_follows_from_the_calibration():
     """f B / 30 mm: 420 px x 5 mm / 30 mm = 70, so 80; four times the baseline asks for 280 of 400 px and gets half."""
     assert SemiGlobalMatching.for_camera(camera()).largest == 80

@@ -145,6 +145,28 @@ def test_images_that_cannot_be_used_are_refused():
         tracker.start(stereo(*apart), tool())
 
 
+def test_a_mask_and_a_disparity_of_the_users_own_are_used():
+    """On a grey picture the built-in mask finds nothing; the user's say where the tissue is, and how far: f B / d."""
+    pair = stereo(PlaneSheet())
+    left, right = (
+        side.mean(axis=2, keepdims=True).repeat(3, axis=2).astype(np.uint8) for side in (pair.left, pair.right)
+    )
+    grey = StereoPair(left=left, right=right)
+    with pytest.raises(PerceptionError, match="no tissue"):
+        StereoTracker(camera(), spacing=SPACING).start(grey, tool())
+
+    def mask(image):
+        inside = np.zeros(image.shape[:2], bool)
+        inside[65:235, 115:285] = True
+        return inside
+
+    def disparity(left, _right):
+        return np.full(left.shape[:2], FOCAL * BASELINE / 0.11, np.float32)
+
+    sheet = StereoTracker(camera(), spacing=SPACING, mask=mask, disparity=disparity).start(grey, tool())
+    assert len(sheet.rest) > 80 and np.abs(sheet.rest[:, 2]).max() < 1e-3
+
+
 def test_tracking_before_a_start_is_refused():
     with pytest.raises(ValueError, match="call start"):
         StereoTracker(camera()).track(BLACK, tool(), predicted=np.zeros((3, 3)))

@@ -27,6 +27,7 @@ from jiggle_mj.observation import (
 )
 from jiggle_mj.recording import Recording, RecordingWriter
 from jiggle_mj.recording_contents import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, SCHEMAS, TF
+from jiggle_mj.recording_declaration import DECLARATION, MESH
 from jiggle_mj.recording_frames import camera_transforms
 from jiggle_mj.recording_moments import Stamped, group_moments
 from jiggle_mj.recording_schemas import (
@@ -326,6 +327,44 @@ def test_other_topics_are_counted_and_ignored(tmp_path):
     recording = Recording.open(bag.output.path)
     assert recording.ignored == {"/joint_states": 4} and len(list(recording)) == 1
     assert recording.declaration == Declaration() and recording.metadata == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("{", "cannot be read"),
+        ('{"youngs": 3.0}', "youngs"),
+        ('{"poisson": 0.5}', r"poisson must be in \[0, 0\.5\)"),
+    ],
+)
+def test_a_declaration_that_is_none_is_refused(tmp_path, text, complaint):
+    with pytest.raises(RecordingError, match=complaint):
+        Recording.open(declaring(tmp_path / "odd.mcap", text))
+
+
+def test_a_declaration_keeps_the_defaults_of_what_it_leaves_out(tmp_path):
+    recording = Recording.open(declaring(tmp_path / "short.mcap", '{"thickness": 0.002}'))
+    assert recording.declaration == Declaration(thickness=2e-3)
+
+
+def declaring(path: Path, text: str) -> Path:
+    bag = Bag(path)
+    bag.output.metadata(DECLARATION, {"json": text})
+    bag.tool(0)
+    bag.output.message(POINTS, 0, point_cloud(0, dict(zip("xyz", np.zeros((3, 4)), strict=True))))
+    bag.output.close()
+    return path
+
+
+def test_a_declared_mesh_without_its_tracks_is_refused(tmp_path):
+    bag = Bag(tmp_path / "odd.mcap")
+    bag.output.metadata(DECLARATION, {"json": "{}"})
+    bag.output.arrays(MESH, {"vertices": np.zeros((3, 3)), "faces": np.array([[0, 1, 2]])})
+    bag.tool(0)
+    bag.output.message(POINTS, 0, point_cloud(0, dict(zip("xyz", np.zeros((3, 4)), strict=True))))
+    bag.output.close()
+    with pytest.raises(RecordingError, match="must hold vertices, faces, track_id"):
+        Recording.open(tmp_path / "odd.mcap")
 
 
 def test_truth_is_refused(tmp_path):

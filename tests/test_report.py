@@ -132,6 +132,7 @@ def synthetic() -> dict:
         estimates=estimates,
         detection=detection,
         prior_entropy=420.0,
+        n_frames=41,
         skipped=[(20, "the right image is missing")],
     )
     camera = StereoCamera.rectified(

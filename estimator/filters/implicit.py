@@ -78,13 +78,9 @@ class ImplicitFilter(eqx.Module):
     """tau [N]."""
     grip_stiffness: Float[Array, ""]
     """Stiffness of the tethers of held particles [N/m]."""
-    state_steps: int = eqx.field(static=True)
-    """Most Gauss-Newton steps on the state alone, before the one on state and belief."""
 
     @classmethod
-    def build(
-        cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, grip_stiffness: float, state_steps: int = 8
-    ) -> "ImplicitFilter":
+    def build(cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, grip_stiffness: float) -> "ImplicitFilter":
         """Prepare the index tables for a mesh and its energy; force_sd [N], grip_stiffness [N/m]."""
         near = sp.csr_array(mesh.adjacency)
         near.sort_indices()
@@ -109,7 +105,6 @@ class ImplicitFilter(eqx.Module):
             places=jnp.asarray(layout.pair_index(neighbours)),
             force_sd=jnp.asarray(force_sd, dtype=float),
             grip_stiffness=jnp.asarray(grip_stiffness, dtype=float),
-            state_steps=state_steps,
         )
 
     def update(
@@ -168,7 +163,7 @@ class ImplicitFilter(eqx.Module):
             return *look(following), count + 1
 
         def unfinished(state):
-            return state[2] & (state[3] < self.state_steps)
+            return state[2] & (state[3] < STATE_STEPS)
 
         return jax.lax.while_loop(unfinished, step, (*look(x), jnp.asarray(1)))[0]
 
@@ -293,6 +288,8 @@ class _Frame(eqx.Module):
 
 SETTLED = 0.5
 """A step that lowers the cost by less than this share ends the search for the state."""
+STATE_STEPS = 8
+"""Most Gauss-Newton steps on the state alone, before the one on state and belief."""
 POLISH_STEPS = 2
 """Steps of the state after the belief has changed."""
 FAINT = 1.0

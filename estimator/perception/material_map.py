@@ -12,6 +12,10 @@ from scipy.sparse import csr_array
 
 RIM = 2
 """Pixels at the tissue's edge that are left out: they blend with what lies behind [px]."""
+REACH = 8.0
+"""How far triangles are continued beyond the rim [px]."""
+MARGIN = 14
+"""Empty border around the region of interest [px]."""
 
 
 class MaterialMap:
@@ -22,9 +26,6 @@ class MaterialMap:
         uv: Float[np.ndarray, "n 2"],
         faces: Int[np.ndarray, "f 3"],
         tissue: Bool[np.ndarray, "height width"],
-        *,
-        reach: float = 8.0,
-        margin: int = 14,
     ):
         """Rasterise the mesh.
 
@@ -32,12 +33,10 @@ class MaterialMap:
             uv: particles in the first left image [px].
             faces: triangles.
             tissue: tissue pixels of the first left image.
-            reach: how far triangles are continued beyond the rim [px].
-            margin: empty border around the region of interest [px].
         """
         height, width = tissue.shape
-        low = np.maximum(np.floor(uv.min(axis=0)).astype(int) - margin, 0)
-        high = np.minimum(np.ceil(uv.max(axis=0)).astype(int) + margin + 1, (width, height))
+        low = np.maximum(np.floor(uv.min(axis=0)).astype(int) - MARGIN, 0)
+        high = np.minimum(np.ceil(uv.max(axis=0)).astype(int) + MARGIN + 1, (width, height))
         self.region = (slice(low[1], high[1]), slice(low[0], high[0]))
         """Rows and columns of the region of interest."""
         self.shape = (int(high[1] - low[1]), int(high[0] - low[0]))
@@ -51,7 +50,7 @@ class MaterialMap:
         distance_transform_edt(owner == 0, return_indices=True, distances=distance, indices=nearest)
         owner = owner[nearest[0], nearest[1]] - 1
         whole = cv2.erode(np.pad(tissue, 1).astype(np.uint8), np.ones((3, 3), np.uint8), iterations=RIM)[1:-1, 1:-1]
-        self.support = whole.astype(bool)[self.region] & (distance < reach)
+        self.support = whole.astype(bool)[self.region] & (distance < REACH)
         """Pixels whose material point the mesh knows."""
         self._barycentric = _barycentric(self.at, faces, owner, self.support, len(uv))
 

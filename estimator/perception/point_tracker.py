@@ -12,6 +12,7 @@ from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
+from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.observation import DeclaredMesh, MeasuredPoints
 from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
 
@@ -36,6 +37,7 @@ class PointTracker:
 
         Raises:
             PerceptionError: points without identities, or too few of them.
+            MeshError: two sheets.
         """
         found = [_by_id(points) for points in still]
         if self._declared is not None:
@@ -57,7 +59,9 @@ class PointTracker:
             faces = triangulate(flat, float(longest))
             used, faces = np.unique(faces, return_inverse=True)
             self.ids = self.ids[used]
-            sheet = Sheet(rest=rest[used], faces=faces.reshape(-1, 3))
+            faces = faces.reshape(-1, 3)
+            check_mesh(rest[used], faces)
+            sheet = Sheet(rest=rest[used], faces=faces)
             rest_variance = still[0].sd ** 2 / np.array([times[i] for i in self.ids.tolist()])
         self._rest_variance: Float[np.ndarray, " n"] = rest_variance
         return sheet

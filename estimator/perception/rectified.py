@@ -54,7 +54,7 @@ class Rectifier:
 
     def __init__(self, camera: StereoCamera):
         self._size = (camera.left.height, camera.left.width)
-        self._maps = [_maps(calibration) for calibration in (camera.left, camera.right)]
+        self._maps = [rectifying_maps(calibration) for calibration in (camera.left, camera.right)]
 
     def __call__(self, images: StereoPair) -> RectifiedPair:
         """Rectify one pair.
@@ -86,8 +86,8 @@ class Rectifier:
         )
 
 
-def _maps(calibration: CameraCalibration) -> tuple[np.ndarray, np.ndarray] | None:
-    """Where each rectified pixel comes from in the raw image; None when nothing moves."""
+def rectifying_maps(calibration: CameraCalibration) -> tuple[np.ndarray, np.ndarray] | None:
+    """Where each rectified pixel comes from in the raw image, for `cv2.remap`; None when nothing moves."""
     if calibration.rectified:
         return None
     c = calibration

@@ -22,6 +22,8 @@ FEWEST_PARTICLES = 30
 """Below this a sheet is too coarse to say anything about where it is attached."""
 SMALLEST_ANGLE = 18.0
 """Triangles on the rim with a smaller angle are needles and are left out [degrees]."""
+INSET = 0.3
+"""How far inside the contour the outermost particles lie [spacings]."""
 LEAST_MATCHED = 0.2
 """Share of the tissue's pixels that must have a disparity."""
 MOST_SAMPLES = 20000
@@ -54,7 +56,6 @@ def lay_mesh(
     camera: StereoCamera,
     *,
     spacing: float,
-    inset: float = 0.3,
 ) -> ImageMesh:
     """Particles and triangles over one connected sheet.
 
@@ -63,7 +64,6 @@ def lay_mesh(
         disparity: [px], NaN where unknown.
         camera: the calibrated pair.
         spacing: distance between neighbouring particles [m].
-        inset: how far inside the contour its samples lie, in spacings.
 
     Raises:
         PerceptionError: no disparity on the tissue, too few particles, or a mesh in several pieces.
@@ -75,7 +75,7 @@ def lay_mesh(
     frame = _PlaneFrame(cloud, camera, surface)
 
     pixel = _pixel_size(cloud, camera)
-    outline = _outline(mask, inset * spacing / pixel, frame)
+    outline = _outline(mask, INSET * spacing / pixel, frame)
     rim = _resample(outline, spacing, tolerance=0.25 * spacing)
     inner = _lattice(outline, spacing)
     flat = np.concatenate([rim, inner])
