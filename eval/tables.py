@@ -93,7 +93,7 @@ def _scored(folder: Path) -> Json | None:
     figures, made_with = read_result(folder / RESULT), read_estimate(folder / ESTIMATE).metadata
     expected = settings(EstimatorConfig()) | {VERSION: file_metadata()[VERSION]}
     current = all(made_with.get(name) == value for name, value in expected.items())
-    return figures if current and figures["detection"]["n_attached"] is not None else None
+    return figures if current and _value(figures, ("detection", "n_attached")) is not None else None
 
 
 def _value(run: Json, path: tuple[str, ...]) -> float | None:

@@ -79,6 +79,7 @@ def test_the_hold_is_found_where_nothing_is_seen(folder, tmp_path):
     assert not np.isfinite(found.estimates[-1].observed[found.sheet.rest[:, 0] < VIEW - 1e-3]).any()
     reported = found.sheet.rest[found.detection.attached, 0]
     assert np.median(reported) < HOLD and reported.max() < VIEW + 3 * 4e-3
-    figures = score_directory(tmp_path / "out", summary.truth)
-    assert figures["detection"]["n_attached"] == summary.n_attached > 0
-    assert figures == json.loads((tmp_path / "out" / "result.json").read_text())
+    assert summary.truth is not None and summary.n_attached
+    score_directory(tmp_path / "out", summary.truth)
+    figures = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert figures["detection"]["n_attached"] == summary.n_attached

@@ -41,7 +41,8 @@ def test_a_disc_is_found_from_images_alone_and_scored_again_from_the_recording(t
 def test_each_row_of_the_readmes_table_keeps_its_bars(row: Row, tmp_path: Path):
     """PCD, PUG >= 0.95 in a ring; exactly >= 0.95 from particles and >= 0.60 from images; tracking RMS <= 0.6 mm;
     NEES per degree of freedom in [0.5, 2]; nothing reported where nothing is attached."""
-    figures = run_scene(load_scene(row.scene), tmp_path / "run", sensing=row.sensing)
+    run_scene(load_scene(row.scene), tmp_path, sensing=row.sensing)
+    figures = json.loads((tmp_path / "result.json").read_text())
     assert figures["tracking"]["rms_m"] <= 0.6e-3
     if row.scene == "free":
         assert figures["detection"]["n_detected"] == 0
