@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import Disparity, TissueMask
 from jiggle_mj.eval.report import shown_steps, write_report
-from jiggle_mj.eval.score import RECORDED, Json, result, score, write_result
+from jiggle_mj.eval.score import IDENTITY, RECORDED, Json, result, score, write_result
 
 from jiggle_mj.episode import (
     ESTIMATE,
@@ -23,12 +23,13 @@ from jiggle_mj.episode import (
     Episode,
     OnFrame,
     Stopwatch,
+    check_directory,
     clear_directory,
     estimate,
     observe,
-    prepare_directory,
+    recording_identity,
 )
-from jiggle_mj.errors import OutputError
+from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
 from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.observation import StereoPair
@@ -77,13 +78,14 @@ def run_scene(
     from jiggle_mj.scenes import Reference, programme  # here, so that a recording can be estimated without MuJoCo
 
     own = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
-    prepare_directory(directory, own, overwrite=overwrite)
+    check_directory(directory, own, overwrite=overwrite)
     watch = Stopwatch()
     with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference:
         estimator = Estimator(reference.declaration, reference.camera, config=config, mask=mask, disparity=disparity)
         clear_directory(directory, own)
+        about = {RECORDED: scene.name, IDENTITY: recording_identity(reference, seed)}
         frames = observe(reference, programme(scene), directory / RECORDING, seed=seed, watch=watch)
-        episode = estimate(frames, estimator, directory / ESTIMATE, metadata={RECORDED: scene.name}, on_frame=on_frame)
+        episode = estimate(frames, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
     unscored = _result(
         episode, scene=scene.name, seed=seed, sensing=sensing, policy="corners", simulation_s=watch.seconds
     )
@@ -125,11 +127,12 @@ def run_estimator(
     """
     recording = Recording.open(recording_path, allow_truncated=allow_truncated)
     own = (ESTIMATE, RESULT, REPORT)
-    prepare_directory(directory, own, overwrite=overwrite)
+    check_directory(directory, own, overwrite=overwrite)
     estimator = Estimator(recording.declaration, recording.camera, config=config, mask=mask, disparity=disparity)
     clear_directory(directory, own)
     name = recording.metadata.get("name", recording_path.stem)
-    episode = estimate(recording, estimator, directory / ESTIMATE, metadata={RECORDED: name}, on_frame=on_frame)
+    about = {RECORDED: name, IDENTITY: recording.metadata.get("identity", "")}
+    episode = estimate(recording, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
     figures = _result(
         episode,
         scene=name,
@@ -142,27 +145,41 @@ def run_estimator(
     return figures
 
 
-def score_directory(directory: Path, truth: Path) -> Json:
+def score_directory(directory: Path, truth: Path, *, recording: Path | None = None) -> Json:
     """Score an estimate that lies in a folder, and write its report anew with the truth beside it.
 
-    Its pictures come from the recording beside the truth file, or from the folder's run.mcap if that is the one that
-    was estimated.
+    Args:
+        directory: the folder.
+        truth: the truth file.
+        recording: what was estimated, for the report's pictures; `find_recording` looks for it if None.
 
     Raises:
-        RecordingError: the folder holds no estimate, or the file no truth.
+        RecordingError: the folder holds no estimate, the file no truth, or one of another recording.
         OutputError: the estimate did not finish.
     """
+    read = read_estimate(directory / ESTIMATE) if (directory / ESTIMATE).exists() else None
+    if recording is not None and read is not None and not _is_of(read, recording):
+        raise RecordingError(f"{recording} is not the recording that {directory} estimates.")
     figures = score(directory, truth)
-    read = read_estimate(directory / ESTIMATE)
-    beside = truth.with_name(truth.name.replace(".truth.", "."))
-    candidates = (path for path in (beside, directory / RECORDING) if path != truth and path.exists())
-    recording = next((path for path in candidates if _recorded_name(path) == read.metadata.get(RECORDED)), None)
+    assert read is not None
+    recording = recording or find_recording(directory, truth)
     _report(directory, read, figures, recording=recording, truth=read_truth(truth))
     return figures
 
 
-def _recorded_name(path: Path) -> str:
-    return Recording.open(path, allow_truncated=True).metadata.get("name", path.stem)
+def find_recording(directory: Path, truth: Path) -> Path | None:
+    """The recording that a folder estimates: beside the truth file, or the folder's run.mcap; None if neither is it."""
+    read = read_estimate(directory / ESTIMATE)
+    beside = truth.with_name(truth.name.replace(".truth.", "."))
+    candidates = (path for path in (beside, directory / RECORDING) if path != truth and path.exists())
+    return next((path for path in candidates if _is_of(read, path)), None)
+
+
+def _is_of(read: EstimateRecording, recording: Path) -> bool:
+    """Whether an estimate is of this recording, by name and identity."""
+    about = Recording.open(recording, allow_truncated=True).metadata
+    same = about.get("name", recording.stem) == read.metadata.get(RECORDED)
+    return same and about.get("identity", "") == read.metadata.get(IDENTITY, "")
 
 
 def _report(

@@ -18,7 +18,7 @@ from jiggle_mj.eval.flat_map import grid_of, outline, plane_of, spacing
 from jiggle_mj.eval.metrics import DILATIONS, GATE_VARIANCE, agreement, distances
 from jiggle_mj.eval.pictures import pictures, state_of
 from jiggle_mj.eval.tracking import tracking
-from jiggle_mj.eval.verdict import against_truth, found
+from jiggle_mj.eval.verdict import against_truth, found, stiffness_sums
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
@@ -95,7 +95,7 @@ def write_report(
     sentences = [found(sheet, detection, estimates[-1], plane_of(sheet.rest))]
     if truth is not None and carried is not None:
         beside = _beside(sheet, estimates, belief, detection, truth, carried)
-        sentences.append(against_truth(sheet, detection, carried))
+        sentences += [against_truth(sheet, detection, carried), stiffness_sums(sheet, belief, estimates[-1], carried)]
     text = page.from_string((here / "report.html").read_text("utf-8")).render(
         result=result,
         sentences=sentences,

@@ -26,8 +26,8 @@ from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import read_truth
 
 Json = dict[str, object]
-RECORDED = "recording"
-"""Metadata of an estimate: the name of the recording or scene that was estimated."""
+RECORDED, IDENTITY = "recording", "recording.identity"
+"""Metadata of an estimate: name and identity of the recording that was estimated."""
 NO_AGREEMENT = {"pcd": None, "pug": None, "f1": None}
 
 
@@ -148,6 +148,12 @@ def score(directory: Path, truth_path: Path) -> Json:
             f"{truth_path} is the truth of '{truth.scene}', and {directory} the estimate of "
             f"'{recording.metadata[RECORDED]}'; give the truth of the same recording."
         )
+    estimated = recording.metadata.get(IDENTITY, "")
+    if truth.identity and estimated and estimated != truth.identity:
+        raise RecordingError(
+            f"{truth_path} is the truth of another recording of '{truth.scene}' than {directory} estimates (another "
+            "scene file, sensing or seed); give the truth that was written with it."
+        )
     if truth.frames and not {f.index for f in truth.frames} & {e.index for e in recording.estimates}:
         raise RecordingError(f"{truth_path} shares no frame with {directory}; give the truth of the same recording.")
     figures = with_truth(
@@ -174,6 +180,8 @@ def read_result(path: Path) -> Json:
         OutputError: the file is missing or is no JSON object.
     """
     try:
+        if not path.parent.is_dir():
+            raise OutputError(f"{path.parent} is no folder; give the one that 'estimate' or 'run' filled.")
         figures = json.loads(path.read_text())
     except OSError as failure:
         raise OutputError(f"{path} cannot be read ({failure.strerror}); 'estimate' or 'run' writes it.") from failure

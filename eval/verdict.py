@@ -5,7 +5,7 @@ from jiggle_mj.eval.carrying import CarriedTruth
 from jiggle_mj.eval.flat_map import Plane
 from jiggle_mj.eval.metrics import dilate, patches
 
-from jiggle_mj.estimate import Detection, Estimate, Sheet
+from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 
 NAMED_PATCHES = 3
 """Patches whose place is spelled out; the others are counted."""
@@ -45,6 +45,18 @@ def against_truth(sheet: Sheet, detection: Detection, carried: CarriedTruth) -> 
         verb = "lie" if false > 1 else "lies"
         text += f"; {false or 'none'} of the {n_detected} reports {verb} more than one ring off"
     return text + "."
+
+
+def stiffness_sums(sheet: Sheet, belief: Belief, last: Estimate, carried: CarriedTruth) -> str:
+    """Over the attached particles and one ring around them: the estimated sum of b, its deviation, and the true one."""
+    if not carried.attached.any() or not np.isfinite(carried.stiffness).all():
+        return ""
+    near = dilate(carried.attached, sheet.faces, 1)
+    sd = float(np.sqrt(belief.covariance[np.ix_(near, near)].sum()))
+    return (
+        f"Over these and one ring around them b sums to {last.mean[near].sum():.1f} N/m, with a stated standard "
+        f"deviation of {sd:.1f}; the truth is {carried.stiffness[near].sum():.1f}."
+    )
 
 
 def _integer(value: float) -> str:

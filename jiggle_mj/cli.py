@@ -50,7 +50,7 @@ def run(
         out: folder for run.mcap, run.truth.mcap, estimate.mcap, result.json and report.html.
         sensing: what the estimator sees: images; noisy tracked points of the tissue; noisy vertices of the reference.
         seed: of the sensing noise.
-        overwrite: replace results that are already in the folder.
+        overwrite: replace results that are already in the folder, from the moment that the run begins.
         as_json: print result.json to stdout.
     """
     from jiggle_mj.eval.experiment import run_scene
@@ -158,17 +158,22 @@ def estimate(
     _show(figures, out, as_json)
 
 
-def score(directory: PathArgument, /, *, truth: Path, as_json: AsJson = False) -> None:
+def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = None, as_json: AsJson = False) -> None:
     """Score an estimate against a truth file, and write the truth into its report.
 
     Args:
         directory: a folder that `run` or `estimate` filled.
         truth: the truth file, for example run.truth.mcap.
+        recording: what was estimated, for the report's pictures; if left out, it is looked for beside the truth and in
+            the folder.
         as_json: print result.json to stdout.
     """
-    from jiggle_mj.eval.experiment import score_directory
+    from jiggle_mj.eval.experiment import find_recording, score_directory
 
-    _show(score_directory(directory, truth), directory, as_json)
+    figures = score_directory(directory, truth, recording=recording)
+    if figures["sensing"] == "stereo" and not (recording or find_recording(directory, truth)):
+        console.print("the recording is not beside the truth: the report has no pictures; pass --recording for them")
+    _show(figures, directory, as_json)
 
 
 def table(
@@ -230,7 +235,7 @@ def main() -> None:
     except JiggleError as failure:
         _stop(failure, 1)
     except KeyboardInterrupt:
-        _stop("interrupted; what was recorded so far is in the output", 130)
+        _stop("interrupted; the recording so far is whole, and 'jiggle-mj estimate' reads it into another folder", 130)
 
 
 def _stop(failure: object, code: int) -> None:

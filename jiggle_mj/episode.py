@@ -18,6 +18,7 @@ from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.observation import Action, Observation
 from jiggle_mj.recording import Recording, RecordingWriter
+from jiggle_mj.recording_declaration import identity
 from jiggle_mj.truth_recording import TruthWriter
 
 if TYPE_CHECKING:
@@ -58,8 +59,8 @@ class Stopwatch:
         self.seconds += time.perf_counter() - self._began
 
 
-def prepare_directory(directory: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Make an output folder, and check that the files to come may be written.
+def check_directory(directory: Path, names: Iterable[str], *, overwrite: bool) -> None:
+    """Check that the files to come may be written.
 
     Args:
         directory: the folder.
@@ -67,30 +68,32 @@ def prepare_directory(directory: Path, names: Iterable[str], *, overwrite: bool)
         overwrite: results that are there may be replaced; `clear_directory` does it, once nothing stands in the way.
 
     Raises:
-        OutputError: it holds results, is a file, or cannot be made.
+        OutputError: it holds results, or is a file.
     """
     if directory.exists() and not directory.is_dir():
         raise OutputError(f"{directory} is a file; give a folder for the results.")
     there = [name for name in names if (directory / name).exists()]
     if there and not overwrite:
         raise OutputError(f"{directory} already holds {', '.join(there)}; choose another folder or pass --overwrite.")
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as failure:
-        raise OutputError(f"{directory} cannot be written ({failure.strerror}); give another folder.") from failure
 
 
 def clear_directory(directory: Path, names: Iterable[str]) -> None:
-    """Remove an earlier run's files, so that no old report stands beside new results.
+    """Make the folder, and remove an earlier run's files, so that no old report stands beside new results.
 
     Raises:
-        OutputError: one cannot be removed.
+        OutputError: the folder cannot be made, or a file not removed.
     """
     try:
+        directory.mkdir(parents=True, exist_ok=True)
         for name in names:
             (directory / name).unlink(missing_ok=True)
     except OSError as failure:
         raise OutputError(f"{directory} cannot be written ({failure.strerror}); give another folder.") from failure
+
+
+def recording_identity(reference: "Reference", seed: int) -> str:
+    """Ties a recording, its truth and its estimate together: a digest of scene, sensing and seed."""
+    return identity(reference.truth().details["scene"], reference.sensing, seed)
 
 
 def observe(
@@ -116,13 +119,13 @@ def observe(
     with ExitStack() as files:
         recording = truth_file = None
         if path is not None:
-            start = reference.truth()
+            start, name = reference.truth(), recording_identity(reference, seed)
             recording = files.enter_context(
                 RecordingWriter(
                     path,
                     camera=reference.camera,
                     declaration=reference.declaration,
-                    metadata={"name": start.scene, "seed": str(seed), "sensing": reference.sensing},
+                    metadata={"name": start.scene, "seed": str(seed), "sensing": reference.sensing, "identity": name},
                     overwrite=overwrite,
                 )
             )
@@ -134,6 +137,7 @@ def observe(
                     attached=start.attached,
                     scene=start.scene,
                     details=start.details,
+                    identity=name,
                     overwrite=overwrite,
                 )
             )

@@ -20,6 +20,7 @@ from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.observation import DeclaredMesh, MeasuredPoints, Observation, ToolState
 from jiggle_mj.point_files import read_faces, read_frames, read_rows
 from jiggle_mj.recording import RecordingWriter
+from jiggle_mj.recording_declaration import identity
 from jiggle_mj.sheet_triangulation import SheetPlane, extend, triangulate
 from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import write_truth
@@ -76,24 +77,25 @@ def import_folder(
     mesh = _declared_mesh(folder, said, rest)
     held = np.empty(0, int) if isinstance(said.grasp, GraspPath) else read_rows(folder, said.grasp, len(rest), "grasp")
     _check_held(rest, held, names[0])
-    truth = _truth(folder, said, rest, mesh)
+    name = identity(said.name, frames)
+    truth = _truth(folder, said, rest, mesh, name)
     beside = truth_path(out)
     for path in (out, beside):
         if path.exists() and not overwrite:
-            raise OutputError(f"{path} exists; choose another path, or allow it to be overwritten.")
+            raise OutputError(f"{path} exists; choose another path, or allow it to be replaced (--overwrite).")
     skipped: list[tuple[str, str]] = []
     n_frames, n_unseen = 0, 0
     with RecordingWriter(
         out,
         camera=None,
         declaration=replace(said.declaration, mesh=mesh),
-        metadata={"name": said.name, "source": said.source},
+        metadata={"name": said.name, "source": said.source, "identity": name},
         overwrite=overwrite,
     ) as writer:
-        for number, (positions, name) in enumerate(zip(frames, names, strict=True)):
+        for number, (positions, file) in enumerate(zip(frames, names, strict=True)):
             unseen = ~np.isfinite(positions).all(axis=1)
             if unseen.all() or (len(held) and not np.isfinite(positions[held] - rest[held]).all(axis=1).any()):
-                skipped.append((name, "no finite point" if unseen.all() else "no grasped point seen"))
+                skipped.append((file, "no finite point" if unseen.all() else "no grasped point seen"))
                 continue
             tool = _tool(said, steps[number], positions, rest, held)
             points = MeasuredPoints(positions=positions, track_id=np.arange(len(rest)), sd=said.noise_sd)
@@ -216,7 +218,7 @@ def _extended(
 
 
 def _truth(
-    folder: Path, said: MeasuredRecording, rest: Float[np.ndarray, "n 3"], mesh: DeclaredMesh | None
+    folder: Path, said: MeasuredRecording, rest: Float[np.ndarray, "n 3"], mesh: DeclaredMesh | None, name: str
 ) -> Truth | None:
     """Presence of attachments only; nothing is known of true positions, so there are no frames."""
     if said.attached is None:
@@ -228,7 +230,15 @@ def _truth(
         assert mesh is not None and said.extension is not None
         plane = SheetPlane.through(mesh.vertices[mesh.track_id >= 0], said.extension.axis)
         vertices, faces, attached = mesh.vertices, mesh.faces, plane.beyond(mesh.vertices, said.attached)
-    return Truth(rest=vertices, faces=faces, attached=attached, frames=(), scene=said.name, details=said.truth_details)
+    return Truth(
+        rest=vertices,
+        faces=faces,
+        attached=attached,
+        frames=(),
+        scene=said.name,
+        identity=name,
+        details=said.truth_details,
+    )
 
 
 def _truth_sheet(

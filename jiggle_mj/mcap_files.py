@@ -47,8 +47,10 @@ class McapOutput:
 
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         self.path = Path(path)
+        if self.path.is_dir():
+            raise OutputError(f"{self.path} is a folder; give a file, such as {self.path / 'run.mcap'}.")
         if self.path.exists() and not overwrite:
-            raise OutputError(f"{self.path} exists; choose another path, or allow it to be overwritten.")
+            raise OutputError(f"{self.path} exists; choose another path, or allow it to be replaced (--overwrite).")
         try:
             self._file = open(self.path, "wb")
         except OSError as failure:
@@ -141,7 +143,8 @@ def iterate_records(
         if not complete and not allow_truncated:
             raise RecordingError(
                 f"{path} is truncated: whole records end at byte {whole} and the MCAP footer is missing "
-                "(was the recording cut off?). Record it again, or allow truncated files to read what is there."
+                "(was the recording cut off?). Record it again, or read what is there with allow_truncated=True "
+                "(--allow-truncated)."
             )
         file.seek(0)
         source = _FirstBytes(file, whole)

@@ -3,6 +3,7 @@
 A declared mesh travels as an npz attachment, all else as JSON in metadata records.
 """
 
+import hashlib
 import json
 from dataclasses import fields, replace
 from importlib.metadata import version
@@ -23,6 +24,14 @@ def file_metadata() -> dict[str, str]:
     """What every file says of its making: the format, units and versions; no date."""
     packages = ("jiggle-mj", "numpy", "mcap", "foxglove-schemas-protobuf", "opencv-python-headless")
     return {"format": FORMAT, "units": "SI (m, N, s), time in ns"} | {f"version.{p}": version(p) for p in packages}
+
+
+def identity(*parts: object) -> str:
+    """A name for a recording, the same for the same contents: 16 hexadecimal digits over arrays and JSON values."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part.tobytes() if isinstance(part, np.ndarray) else json.dumps(part, sort_keys=True).encode())
+    return digest.hexdigest()[:16]
 
 
 def write_declaration(output: McapOutput, declaration: Declaration) -> None:

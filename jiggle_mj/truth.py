@@ -37,5 +37,7 @@ class Truth:
     frames: tuple[TruthFrame, ...]
     scene: str
     """Name of the scene or recording."""
+    identity: str = ""
+    """Of the recording that this is the truth of, as its metadata has it; empty where unknown."""
     details: dict[str, object]
     """Whatever else the maker wants on record (the scene as typed, disturbances), JSON-serialisable."""

@@ -40,6 +40,7 @@ class TruthWriter:
         faces: triangles.
         attached: which vertices are attached at the start.
         scene: name of the scene or recording.
+        identity: of the recording, as its metadata has it.
         details: anything else, JSON-serialisable.
         overwrite: replace a file that is there.
 
@@ -56,13 +57,13 @@ class TruthWriter:
         attached: Bool[np.ndarray, " n"],
         scene: str,
         details: dict[str, object],
+        identity: str = "",
         overwrite: bool = False,
     ) -> None:
-        text = json.dumps(details, sort_keys=True)
-        self._scene = scene
+        self._said = {"scene": scene, "identity": identity}
         self._output = McapOutput(path, overwrite=overwrite)
         self._output.metadata(METADATA, file_metadata())
-        self._output.metadata(DETAILS, {"scene": scene, "details": text})
+        self.conclude(details)
         self._output.arrays(FACES, {"faces": np.asarray(faces)})
         columns = dict(zip("xyz", np.asarray(rest, float).T, strict=True)) | {"attached": np.asarray(attached)}
         self._output.message(REST, 0, point_cloud(0, columns))
@@ -86,8 +87,8 @@ class TruthWriter:
         output.flush()
 
     def conclude(self, details: dict[str, object]) -> None:
-        """Write the details again, with what only the end could know; a reader takes the last."""
-        self._output.metadata(DETAILS, {"scene": self._scene, "details": json.dumps(details, sort_keys=True)})
+        """Write the details, once more with what only the end could know; a reader takes the last."""
+        self._output.metadata(DETAILS, self._said | {"details": json.dumps(details, sort_keys=True)})
 
     def close(self) -> None:
         """Write the index and close the file."""
@@ -107,6 +108,7 @@ def write_truth(path: str | os.PathLike[str], truth: Truth, *, overwrite: bool =
         attached=truth.attached,
         scene=truth.scene,
         details=truth.details,
+        identity=truth.identity,
         overwrite=overwrite,
     ) as writer:
         for frame in truth.frames:
@@ -143,6 +145,7 @@ def read_truth(path: str | os.PathLike[str], *, allow_truncated: bool = False) -
         attached=rest["attached"].astype(bool),
         frames=tuple(_parse_frame(*frame) for frame in frames),
         scene=said["scene"],
+        identity=said.get("identity", ""),
         details=json.loads(said["details"]),
     )
 

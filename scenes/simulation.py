@@ -58,6 +58,7 @@ def check_state(model: mujoco.MjModel, data: mujoco.MjData, *, dump_dir: Path | 
     if size < MAX_COORDINATE and speed < MAX_SPEED:
         return
     folder = dump_dir if dump_dir is not None else Path(tempfile.mkdtemp(prefix="jiggle-mj-"))
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "unstable_state.npz"
     np.savez(path, qpos=data.qpos, qvel=data.qvel, time=data.time, mocap_pos=data.mocap_pos, eq_active=data.eq_active)
     raise SimulationError(

@@ -63,6 +63,22 @@ def test_estimate_then_score_with_json_print_json_and_nothing_else(whole, tmp_pa
     assert np.isclose(scored["tracking"]["rms_m"], reference["tracking"]["rms_m"], rtol=1e-12)
 
 
+def test_a_truth_of_the_same_name_but_another_scene_is_refused_and_changes_nothing(
+    whole, tmp_path, monkeypatch, capsys
+):
+    _, scene, made = whole
+    moved = tmp_path / scene.name
+    moved.write_text(scene.read_text().replace("centre = [0.0, 0.0]", "centre = [0.01, 0.0]"))
+    assert call(monkeypatch, "record", moved, "--out", tmp_path / "run.mcap", "--sensing", "particles") == 0
+    before = (made / "result.json").read_bytes()
+    assert call(monkeypatch, "score", made, "--truth", tmp_path / "run.truth.mcap") == 1
+    assert "truth of another recording of 'tiny'" in capsys.readouterr().err
+    right = made / "run.truth.mcap"
+    assert call(monkeypatch, "score", made, "--truth", right, "--recording", tmp_path / "run.mcap") == 1
+    assert "not the recording that" in capsys.readouterr().err
+    assert (made / "result.json").read_bytes() == before
+
+
 def test_a_folder_with_results_is_refused_with_2_and_replaced_on_demand(whole, tmp_path, monkeypatch, capsys):
     _, scene, made = whole
     before = (made / "result.json").read_bytes()

@@ -8,7 +8,7 @@ from jiggle_mj.estimator import Estimator
 from jiggle_mj.scenes import Reference, load_scene, programme
 from tiny_scene import scene_file
 
-from jiggle_mj.episode import clear_directory, estimate, observe, prepare_directory
+from jiggle_mj.episode import check_directory, clear_directory, estimate, observe
 from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
 from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.observation import Declaration, Wait
@@ -107,9 +107,9 @@ def test_a_folder_with_results_is_kept_unless_overwriting_is_allowed(tmp_path):
     for name in ("run.mcap", "mine.txt"):
         (tmp_path / name).write_text("kept")
     with pytest.raises(OutputError, match=r"already holds run\.mcap; choose another folder or pass --overwrite"):
-        prepare_directory(tmp_path, ["run.mcap"], overwrite=False)
+        check_directory(tmp_path, ["run.mcap"], overwrite=False)
     assert (tmp_path / "run.mcap").read_text() == "kept"
-    prepare_directory(tmp_path, ["run.mcap"], overwrite=True)
+    check_directory(tmp_path, ["run.mcap"], overwrite=True)
     assert (tmp_path / "run.mcap").exists()
     clear_directory(tmp_path, ["run.mcap"])
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
@@ -118,4 +118,4 @@ def test_a_folder_with_results_is_kept_unless_overwriting_is_allowed(tmp_path):
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
     (tmp_path / "out").write_text("a file")
     with pytest.raises(OutputError, match="is a file; give a folder"):
-        prepare_directory(tmp_path / "out", ["run.mcap"], overwrite=True)
+        check_directory(tmp_path / "out", ["run.mcap"], overwrite=True)

@@ -15,7 +15,7 @@ from jiggle_mj.eval.flat_map import grid_of, outline, plane_of
 from jiggle_mj.eval.pictures import pictures
 from jiggle_mj.eval.report import write_report
 from jiggle_mj.eval.score import result, with_truth
-from jiggle_mj.eval.verdict import against_truth, found
+from jiggle_mj.eval.verdict import against_truth, found, stiffness_sums
 from scipy.spatial import Delaunay
 
 from jiggle_mj.camera import StereoCamera
@@ -251,6 +251,13 @@ def test_the_sentence_counts_patches_and_hits_by_hand():
     told = against_truth(sheet, detection, CarriedTruth(attached=attached, stiffness=attached * 1.0))
     assert "In truth 3 are attached: 1 of them reported exactly, 1 within one mesh ring;" in told
     assert told.endswith("1 of the 3 reports lies more than one ring off.")
+    carried = CarriedTruth(attached=mask, stiffness=mask * 1.5)
+    belief = Belief(mean=np.full(10, 0.8), covariance=0.01 * np.eye(10) + 0.01)
+    # A ring around 0, 1 and 9 is 0-3, 7-9: seven times 0.8; variance 7 * 0.01 + 49 * 0.01; truth 3 * 1.5.
+    summed = stiffness_sums(sheet, belief, last, carried)
+    assert "sums to 5.6 N/m, with a stated standard deviation of 0.7; the truth is 4.5." in summed
+    welded = replace(carried, stiffness=np.where(mask, np.inf, 0.0))
+    assert stiffness_sums(sheet, belief, last, welded) == ""
     nothing = CarriedTruth(attached=np.zeros(10, bool), stiffness=np.zeros(10))
     assert against_truth(sheet, detection, nothing) == "In truth nothing is attached. All 3 reports are false."
 

@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
-from jiggle_mj.eval.score import RECORDED, read_result, result, score, with_truth, write_result
+from jiggle_mj.eval.score import IDENTITY, RECORDED, read_result, result, score, with_truth, write_result
 from result_keys import KEYS, keys
 
 from jiggle_mj.errors import OutputError, RecordingError
@@ -51,6 +51,7 @@ TRUTH = Truth(
         TruthFrame(index=k, time=k * 1000, positions=REST, stiffness=STIFFNESS, tip=np.zeros(3)) for k in range(3)
     ),
     scene="by hand",
+    identity="this one",
     details={},
 )
 
@@ -126,7 +127,9 @@ def test_a_tissue_without_attachments_has_no_recall_but_counts_reports():
 def written(folder, settings=MappingProxyType({})):
     """A folder as `estimate` leaves it, and the truth beside it."""
     write_result(folder / "result.json", unscored())
-    with EstimateWriter(folder / "estimate.mcap", SHEET, {RECORDED: "by hand", **settings}) as writer:
+    with EstimateWriter(
+        folder / "estimate.mcap", SHEET, {RECORDED: "by hand", IDENTITY: "this one", **settings}
+    ) as writer:
         for one in ESTIMATES:
             writer.write(one)
         writer.finish(BELIEF, DETECTION, skipped=[(1, "NaN in the pose")])
@@ -150,6 +153,11 @@ def test_a_folder_that_cannot_be_scored_is_refused_with_what_to_do(tmp_path):
     write_truth(folder / "other.truth.mcap", other)
     with pytest.raises(RecordingError, match="truth of the same recording"):
         score(folder, folder / "other.truth.mcap")
+    write_truth(folder / "moved.truth.mcap", replace(TRUTH, identity="another"))
+    with pytest.raises(RecordingError, match="another recording of 'by hand'"):
+        score(folder, folder / "moved.truth.mcap")
+    with pytest.raises(OutputError, match="is no folder"):
+        score(folder / "absent", folder / "run.truth.mcap")
     write_truth(folder / "line.truth.mcap", replace(TRUTH, scene="line"))
     with pytest.raises(RecordingError, match=r"truth of 'line', and .* the estimate of 'by hand'"):
         score(folder, folder / "line.truth.mcap")
