@@ -7,14 +7,16 @@ goes perception -> grip -> filter. Sees nothing but observations, the camera's c
 import time
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from jiggle_mj.estimator.belief import BoundaryBelief
-from jiggle_mj.estimator.filters.implicit import Evidence, ImplicitFilter
+from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
+from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter
 from jiggle_mj.estimator.grip import GripHold
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.perception import Disparity, PointTracker, StereoTracker, TissueMask, Track
@@ -28,6 +30,8 @@ from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
+FilterName = Literal["implicit", "explicit"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorConfig:
@@ -35,8 +39,12 @@ class EstimatorConfig:
 
     spacing: float = 4.4e-3
     """Between the particles of a mesh laid over images [m]."""
+    filter: FilterName = "implicit"
+    """How a frame enters the belief: through the balance of forces, or, as in the paper, through a simulated step."""
+    samples: int = 1
+    """Frames that each update of the explicit filter simulates, the latest among them."""
     membrane: Membrane = "triangles"
-    """Law of the sheet's plane: St Venant-Kirchhoff triangles, or the paper's springs along the edges."""
+    """Law of the sheet's plane, for the implicit filter: St Venant-Kirchhoff triangles, or springs along the edges."""
     prior_sd: float = 1 / 75
     """Standard deviation of each attachment stiffness before anything is seen [k]."""
     force_sd: float = 4.5e-3
@@ -53,6 +61,10 @@ class EstimatorConfig:
         for name in ("spacing", "prior_sd", "force_sd", "grip_sd", "grip_stiffness", "detect_above"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"EstimatorConfig.{name} must be above 0; got {getattr(self, name)}.")
+        if self.filter not in get_args(FilterName):
+            raise ValueError(f"EstimatorConfig.filter must be 'implicit' or 'explicit'; got {self.filter!r}.")
+        if not (isinstance(self.samples, int) and self.samples >= 1):
+            raise ValueError(f"EstimatorConfig.samples must be an integer of at least 1; got {self.samples}.")
         if self.membrane not in ("triangles", "edges"):
             raise ValueError(f"EstimatorConfig.membrane must be 'triangles' or 'edges'; got {self.membrane!r}.")
 
@@ -89,7 +101,7 @@ class Estimator:
         self._points = PointTracker(declaration.mesh)
         self._still: list[MeasuredPoints] = []
         self._sheet: Sheet | None = None
-        self._filter: ImplicitFilter | None = None
+        self._filter: Filter | None = None
         self._hold: GripHold | None = None
         self._closing: ToolState | None = None
         self._used = False
@@ -170,7 +182,7 @@ class Estimator:
             return None
         hold, before = self._grip(track, tool)
         evidence, start = self._evidence(track, tool, hold, before)
-        update = _update(self._filter, self._belief, jnp.asarray(self._b), evidence, jnp.asarray(start))
+        update = self._filter.update(self._belief, jnp.asarray(self._b), evidence, jnp.asarray(start))
         if not (np.isfinite(update.x).all() and np.isfinite(update.b).all()):
             raise PerceptionError(
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
@@ -219,15 +231,19 @@ class Estimator:
                 raise
             self.skipped.append((index, str(failure)))
 
-    def _begin(self) -> ImplicitFilter:
+    def _begin(self) -> Filter:
         """Build the model once the rest shape is known."""
         if self._sheet is None:
             self._sheet = self._points.start(self._still)
         mesh, k = SheetMesh(self._sheet.rest, self._sheet.faces), self.declaration.membrane_stiffness
         self._field = MeshField(SheetPlane.through(mesh.rest).flatten(mesh.rest), mesh.faces)
-        self._belief = BoundaryBelief.prior(mesh.n, mean=0.0, sd=self.config.prior_sd * k)
+        explicit = self.config.filter == "explicit"
+        self._belief = BoundaryBelief.prior(mesh.n, mean=PRIOR_MEAN if explicit else 0.0, sd=self.config.prior_sd * k)
         self.prior_entropy = float(self._belief.entropy())
         self._x, self._b = mesh.rest, np.zeros(mesh.n)
+        if explicit:
+            stiffness = self.config.grip_stiffness * k
+            return MultipleShooting(mesh, self.declaration, grip_stiffness=stiffness, samples=self.config.samples)
         return ImplicitFilter.build(
             mesh,
             surrogate(mesh, self.declaration, membrane=self.config.membrane),
@@ -283,6 +299,11 @@ class Estimator:
             precision=jnp.asarray(precision),
             held=jnp.asarray(held),
             loaded=jnp.asarray(self._field.widened(held)),
+            pull=Pull(
+                before=jnp.asarray(before),
+                tip=jnp.asarray(tool.position),
+                length=jnp.asarray(np.linalg.norm(hold.closed_at - hold.tip, axis=1)),
+            ),
         )
         return evidence, start
 
@@ -293,9 +314,6 @@ class Estimator:
         if tool.held_tracks:
             return np.isin(self._points.ids, tool.held_tracks)
         return None if self.declaration.mesh is None else self.declaration.mesh.held
-
-
-_update = eqx.filter_jit(ImplicitFilter.update)
 
 
 @cache

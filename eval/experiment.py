@@ -87,7 +87,13 @@ def run_scene(
         frames = observe(reference, programme(scene), directory / RECORDING, seed=seed, watch=watch)
         episode = estimate(frames, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
     unscored = _result(
-        episode, scene=scene.name, seed=seed, sensing=sensing, policy="corners", simulation_s=watch.seconds
+        episode,
+        scene=scene.name,
+        seed=seed,
+        sensing=sensing,
+        estimator=estimator.config.filter,
+        policy="corners",
+        simulation_s=watch.seconds,
     )
     write_result(directory / RESULT, unscored)
     scored = score(directory, truth_path(directory / RECORDING))
@@ -138,6 +144,7 @@ def run_estimator(
         scene=name,
         seed=int(recording.metadata.get("seed", 0)),
         sensing=recording.metadata.get("sensing", "points" if recording.camera is None else "stereo"),
+        estimator=estimator.config.filter,
         policy="recorded",
     )
     write_result(directory / RESULT, figures)
@@ -223,6 +230,7 @@ def _result(
     scene: str,
     seed: int,
     sensing: str,
+    estimator: str,
     policy: str,
     simulation_s: float | None = None,
 ) -> Json:
@@ -230,7 +238,7 @@ def _result(
         scene=scene,
         seed=seed,
         sensing=sensing,
-        estimator="implicit",
+        estimator=estimator,
         policy=policy,
         sheet=episode.sheet,
         estimates=episode.estimates,

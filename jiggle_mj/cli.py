@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from jiggle_mj.observation import Observation
 
 Sensing = Literal["stereo", "points", "particles"]
+FilterName = Literal["implicit", "explicit"]
 PathArgument = Annotated[Path, tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -39,6 +40,7 @@ def run(
     *,
     out: Out,
     sensing: Sensing = "stereo",
+    estimator: FilterName = "implicit",
     seed: int = 0,
     overwrite: bool = False,
     as_json: AsJson = False,
@@ -49,16 +51,20 @@ def run(
         scene: a shipped scene (arc, line, ...) or the path of a scene file.
         out: folder for run.mcap, run.truth.mcap, estimate.mcap, result.json and report.html.
         sensing: what the estimator sees: images; noisy tracked points of the tissue; noisy vertices of the reference.
+        estimator: implicit is ours; explicit is the paper's filter.
         seed: of the sensing noise.
         overwrite: replace results that are already in the folder, from the moment that the run begins.
         as_json: print result.json to stdout.
     """
+    from jiggle_mj.estimator import EstimatorConfig
     from jiggle_mj.eval.experiment import run_scene
     from jiggle_mj.scenes import load_scene, programme
 
-    loaded = load_scene(scene)
+    loaded, config = load_scene(scene), EstimatorConfig(filter=estimator)
     with _progress(sum(1 for _ in programme(loaded)), f"run {loaded.name}") as on_frame:
-        figures = run_scene(loaded, out, seed=seed, sensing=sensing, overwrite=overwrite, on_frame=on_frame)
+        figures = run_scene(
+            loaded, out, seed=seed, sensing=sensing, config=config, overwrite=overwrite, on_frame=on_frame
+        )
     _show(figures, out, as_json)
 
 
@@ -136,6 +142,7 @@ def estimate(
     /,
     *,
     out: Out,
+    estimator: FilterName = "implicit",
     allow_truncated: bool = False,
     overwrite: bool = False,
     as_json: AsJson = False,
@@ -145,16 +152,25 @@ def estimate(
     Args:
         recording: an MCAP file.
         out: folder for estimate.mcap, result.json and report.html.
+        estimator: implicit is ours; explicit is the paper's filter.
         allow_truncated: use what is whole of a recording that was cut off.
         overwrite: replace results that are already in the folder.
         as_json: print result.json to stdout.
     """
+    from jiggle_mj.estimator import EstimatorConfig
     from jiggle_mj.eval.experiment import run_estimator
     from jiggle_mj.recording import Recording
 
     length = len(Recording.open(recording, allow_truncated=allow_truncated))
     with _progress(length, f"estimate {recording.name}") as on_frame:
-        figures = run_estimator(recording, out, overwrite=overwrite, allow_truncated=allow_truncated, on_frame=on_frame)
+        figures = run_estimator(
+            recording,
+            out,
+            config=EstimatorConfig(filter=estimator),
+            overwrite=overwrite,
+            allow_truncated=allow_truncated,
+            on_frame=on_frame,
+        )
     _show(figures, out, as_json)
 
 

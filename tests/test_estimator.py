@@ -253,6 +253,20 @@ def test_settings_out_of_range_are_refused(change):
         EstimatorConfig(**change)
 
 
+def test_an_update_of_no_sample_is_refused():
+    with pytest.raises(ValueError, match=r"EstimatorConfig\.samples must be an integer of at least 1; got 0"):
+        EstimatorConfig(samples=0)
+
+
+def test_the_papers_filter_runs_behind_the_same_front():
+    """Six frames with two samples each; what it finds is the table's business."""
+    estimator = Estimator(DECLARATION, config=dataclasses.replace(CONFIG, filter="explicit", samples=2))
+    estimates = [estimator.update(one) for one in episode()[:6]][2:]
+    entropies = [estimator.prior_entropy, *(one.entropy for one in estimates)]
+    assert (np.diff(entropies) < 0).all()
+    assert all((one.mean >= 0).all() and np.isfinite(one.positions).all() for one in estimates)
+
+
 @pytest.mark.parametrize("ask", ["belief", "detection"])
 def test_asking_for_results_before_the_first_grasp_is_refused_in_words(ask):
     with pytest.raises(ValueError, match="not known before the first frame with closed jaws"):

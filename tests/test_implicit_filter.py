@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jiggle_mj.estimator.belief import BoundaryBelief
-from jiggle_mj.estimator.filters.implicit import FAINT, Evidence, ImplicitFilter
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.implicit import FAINT, ImplicitFilter
 from scipy.stats import chi2
 from small_sheet import DECLARATION, STIFFNESS, Lift, attached, dense, lifts, sheet, sheet_energy
 
@@ -19,7 +20,7 @@ PRIOR_SD = STIFFNESS / 2
 THRESHOLD = STIFFNESS / 3
 """[N/m]."""
 
-update = eqx.filter_jit(ImplicitFilter.update)
+update = ImplicitFilter.update
 
 
 @eqx.filter_jit

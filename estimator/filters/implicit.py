@@ -29,36 +29,8 @@ from jiggle_mj.estimator.block_tridiagonal import (
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Tether
 from jiggle_mj.estimator.equilibrium import equilibrium
+from jiggle_mj.estimator.filters.evidence import Evidence, Update
 from jiggle_mj.estimator.mesh import SheetMesh, pattern
-
-
-class Evidence(eqx.Module):
-    """One frame's measurements of the particles."""
-
-    y: Float[Array, "n 3"]
-    """Observed positions, anything finite where there is none [m]."""
-    precision: Float[Array, "n 3 3"]
-    """R^-1, zero where a particle is missing [1/m^2]."""
-    held: Bool[Array, " n"]
-    """Particles in the grip, which follow the tip."""
-    loaded: Bool[Array, " n"]
-    """Particles that the grip may pull at, the held ones among them, whose balance of forces is unknown."""
-
-
-class Update(eqx.Module):
-    """The outcome of one frame."""
-
-    belief: BoundaryBelief
-    x: Float[Array, "n 3"]
-    """State after the update [m]."""
-    b: Float[Array, " n"]
-    """Non-negative mean [N/m]."""
-    sd: Float[Array, " n"]
-    """Standard deviation of each b, without the constraint [N/m]."""
-    entropy: Float[Array, ""]
-    """Of the belief [nat]."""
-    nis: Float[Array, ""]
-    """Normalised innovation squared per degree of freedom, before the update; 1 where the stated noises are right."""
 
 
 class ImplicitFilter(eqx.Module):
@@ -107,6 +79,7 @@ class ImplicitFilter(eqx.Module):
             grip_stiffness=jnp.asarray(grip_stiffness, dtype=float),
         )
 
+    @eqx.filter_jit
     def update(
         self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:

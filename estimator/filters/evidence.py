@@ -1,0 +1,66 @@
+"""What a frame gives to a filter, and what the filter gives back: one interface for all of them."""
+
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float
+from jiggle_mj.estimator.belief import BoundaryBelief
+
+
+class Pull(eqx.Module):
+    """The tool's step that led to a frame, for filters that simulate it."""
+
+    before: Float[Array, "n 3"]
+    """Positions in the frame before [m]."""
+    tip: Float[Array, " 3"]
+    """Where the tip moved [m]."""
+    length: Float[Array, " n"]
+    """Distance of each particle from the tip when the jaws closed [m]."""
+
+
+class Evidence(eqx.Module):
+    """One frame's measurements of the particles."""
+
+    y: Float[Array, "n 3"]
+    """Observed positions, anything finite where there is none [m]."""
+    precision: Float[Array, "n 3 3"]
+    """R^-1, zero where a particle is missing [1/m^2]."""
+    held: Bool[Array, " n"]
+    """Particles in the grip, which follow the tip."""
+    loaded: Bool[Array, " n"]
+    """Particles that the grip may pull at, the held ones among them, whose balance of forces is unknown."""
+    pull: Pull | None = None
+
+
+class Update(eqx.Module):
+    """The outcome of one frame."""
+
+    belief: BoundaryBelief
+    x: Float[Array, "n 3"]
+    """State after the update [m]."""
+    b: Float[Array, " n"]
+    """Non-negative mean [N/m]."""
+    sd: Float[Array, " n"]
+    """Standard deviation of each b, without the constraint [N/m]."""
+    entropy: Float[Array, ""]
+    """Of the belief [nat]."""
+    nis: Float[Array, ""]
+    """Normalised innovation squared per degree of freedom, before the update; 1 where the stated noises are right."""
+
+
+@runtime_checkable
+class Filter(Protocol):
+    """A way to update the belief; it may keep frames of its own for later updates."""
+
+    def update(
+        self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
+    ) -> Update:
+        """Take one frame into the belief.
+
+        Args:
+            belief: before the frame.
+            b: its non-negative mean [N/m].
+            evidence: what was seen.
+            start: where a search for the state may begin [m].
+        """
+        ...

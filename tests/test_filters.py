@@ -1,0 +1,74 @@
+"""What every filter keeps: it sharpens, repeats itself to the byte, and takes no notice of what was not seen."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
+from jiggle_mj.estimator.filters.explicit import MultipleShooting
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from small_sheet import DECLARATION, corners, lifts, sheet, sheet_energy
+
+NOISE = 2e-4
+K = DECLARATION.membrane_stiffness
+N = sheet().n
+
+
+def implicit() -> Filter:
+    return ImplicitFilter.build(sheet(), sheet_energy(), force_sd=6e-4, grip_stiffness=3 * K)
+
+
+def explicit() -> Filter:
+    return MultipleShooting(sheet(), DECLARATION, grip_stiffness=3 * K, samples=2)
+
+
+def frame(number: int, hidden: np.ndarray | None = None, lie: float = 0.0) -> Evidence:
+    """Frame `number` of the first lift; what is hidden has no precision, and `lie` [m] is added to it."""
+    now, before = lifts()[number], lifts()[number - 1]
+    y = now.x + NOISE * np.random.default_rng(number).normal(size=now.x.shape)
+    precision = np.broadcast_to(np.eye(3) / NOISE**2, (N, 3, 3)).copy()
+    if hidden is not None:
+        precision[hidden] = 0
+        y[hidden] += lie
+    held = jnp.asarray(now.held)
+    length = np.linalg.norm(sheet().rest - corners()[0], axis=1)
+    pull = Pull(before=jnp.asarray(before.x), tip=jnp.asarray(now.tip), length=jnp.asarray(length))
+    return Evidence(y=jnp.asarray(y), precision=jnp.asarray(precision), held=held, loaded=held, pull=pull)
+
+
+def run(filter: Filter, frames: list[Evidence]):
+    belief, b, outcomes = BoundaryBelief.prior(N, mean=1e-4, sd=1.0), jnp.zeros(N), []
+    for one in frames:
+        out = filter.update(belief, b, one, jnp.where(one.precision[:, :1, 0] > 0, one.y, jnp.asarray(sheet().rest)))
+        belief, b = out.belief, out.b
+        outcomes.append(out)
+    return outcomes
+
+
+@pytest.mark.parametrize("make", [implicit, explicit])
+def test_every_filter_sharpens_stays_non_negative_and_repeats_itself(make):
+    frames = [frame(number) for number in (1, 2, 3)]
+    assert isinstance(make(), Filter)
+    first, second = run(make(), frames), run(make(), frames)
+    entropies = [float(BoundaryBelief.prior(N, mean=0.0, sd=1.0).entropy()), *(float(out.entropy) for out in first)]
+    assert (np.diff(entropies) < 0).all()
+    for out, again in zip(first, second, strict=True):
+        assert out.x.shape == (N, 3) and out.b.shape == out.sd.shape == (N,)
+        assert np.asarray(out.b).min() >= 0 and np.asarray(out.sd).max() <= 1 + 1e-9 and float(out.nis) > 0
+        for name in ("x", "b", "sd", "entropy", "nis"):
+            assert np.asarray(getattr(out, name)).tobytes() == np.asarray(getattr(again, name)).tobytes()
+
+
+@pytest.mark.parametrize("make", [implicit, explicit])
+def test_what_was_not_seen_does_not_matter(make):
+    hidden = np.zeros(N, bool)
+    hidden[[3, 20, 44, 60]] = True
+    one, other = (run(make(), [frame(1), frame(2, hidden, lie)])[-1] for lie in (0.0, 0.3))
+    np.testing.assert_allclose(other.belief.precision, one.belief.precision, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(other.b, one.b, atol=1e-9)
+
+
+def test_the_explicit_filter_needs_the_step_that_led_to_the_frame():
+    bare = Evidence(**{name: getattr(frame(1), name) for name in ("y", "precision", "held", "loaded")})
+    with pytest.raises(ValueError, match=r"needs Evidence\.pull"):
+        run(explicit(), [bare])
