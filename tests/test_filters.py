@@ -1,5 +1,7 @@
 """What every filter keeps: it sharpens, repeats itself to the byte, and takes no notice of what was not seen."""
 
+from functools import cache
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ K = DECLARATION.membrane_stiffness
 N = sheet().n
 
 
+@cache
 def implicit() -> Filter:
+    """Keeps nothing, so one will do."""
     return ImplicitFilter.build(sheet(), sheet_energy(), force_sd=6e-4, grip_stiffness=3 * K)
 
 
