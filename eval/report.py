@@ -76,6 +76,7 @@ def write_report(
     kept = shown_steps(estimates, sheet.rest)
     pairs = [] if images is None or camera is None else pictures(estimates, images, camera, kept)
     payload = _payload(sheet, estimates, detection, truth, carried)
+    payload["opening"] = _opening(estimates, kept, sheet.rest)
     payload["pictures"] = [
         {
             "step": pair.step,
@@ -104,6 +105,7 @@ def write_report(
         gate_variance=GATE_VARIANCE,
         has_pictures=bool(pairs),
         n_steps=len(kept),
+        opening=payload["opening"],
         settings=list(_rows(settings)),
         style=Markup((here / "report.css").read_text("utf-8")),
         script=Markup((here / "report.js").read_text("utf-8")),
@@ -247,6 +249,12 @@ def shown_steps(estimates: Sequence[Estimate], rest: np.ndarray) -> list[int]:
     """Positions in `estimates` of the frames on the slider, thinned evenly."""
     count = min(len(estimates), MAX_STEPS, max(2, MAX_PARTICLE_STEPS // len(rest)))
     return np.unique(np.linspace(0, len(estimates) - 1, count).round().astype(int)).tolist()
+
+
+def _opening(estimates: Sequence[Estimate], kept: Sequence[int], rest: np.ndarray) -> int:
+    """The place on the slider that the page opens at: the last frame that is lifted about as far as any."""
+    motion = np.array([np.abs(estimates[step].positions - rest).max() for step in kept])
+    return int(np.flatnonzero(motion >= 0.9 * motion.max())[-1])
 
 
 def _rows(settings: Mapping[str, object], prefix: str = "") -> list[tuple[str, str]]:

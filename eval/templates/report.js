@@ -106,9 +106,9 @@
     lighting: { ambient: 0.72, diffuse: 0.5, specular: 0.05 }, lightposition: { x: 0, y: -2000, z: 3000 }, colorbar: { thickness: 9, len: 0.7, outlinewidth: 0, title: { text: title, side: "right" } }, hovertemplate: "%{intensity:.3g} N/m<extra></extra>" });
   const solidLayout = { height: 420, margin: { l: 0, r: 0, t: 24, b: 0 }, font, paper_bgcolor: "#fff", scene: scene(eye) };
   const colourBy = () => document.querySelector("input[name=colour]:checked").value;
-  const state = { step: steps.length - 1, playing: null };
-  const last = steps[state.step];
-  Plotly.newPlot("solid", [solid(data.faces, last, last.mean, scales.b, data.top_b, "mean b [N/m]")], solidLayout, config);
+  const state = { step: data.opening, playing: null };
+  const shown = steps[state.step];
+  Plotly.newPlot("solid", [solid(data.faces, shown, shown.mean, scales.b, data.top_b, "mean b [N/m]")], solidLayout, config);
   const trueStep = (k) => { if (!truth) return null; for (let j = k; j >= 0; j--) if (truth.steps[j]) return truth.steps[j]; return truth.steps.find(Boolean) || null; };
   const drawsTruth = Boolean(truth && trueStep(state.step) && truth.faces.length && truth.faces[0].length);
   if (drawsTruth) {
