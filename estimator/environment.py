@@ -110,8 +110,7 @@ class Grip(Term):
 
     def _stretch(self, x: Float[Array, "n 1 3"]) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
         d = x[:, 0] - self.tip[None]
-        squared = jnp.sum(d**2, axis=1)
-        return d, jnp.sqrt(jnp.where(squared > 0, squared, jnp.finfo(x.dtype).tiny))
+        return d, lengths(d)
 
     def energy(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
         """[J]."""
@@ -132,6 +131,12 @@ class Grip(Term):
         across = (across if compressive else jnp.maximum(across, 0))[:, None, None]
         window = along + across * (jnp.eye(3, dtype=x.dtype)[None] - along)
         return (self.stiffness[:, None, None] * window)[:, None, :, None, :]
+
+
+def lengths(d: Float[Array, "m 3"]) -> Float[Array, " m"]:
+    """|d|, with a finite derivative where there is none."""
+    squared = jnp.sum(d**2, axis=1)
+    return jnp.sqrt(jnp.where(squared > 0, squared, jnp.finfo(d.dtype).tiny))
 
 
 class Tether(Term):

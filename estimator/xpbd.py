@@ -20,19 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from jiggle_mj.estimator.environment import Grip
+from jiggle_mj.estimator.environment import Grip, lengths
 from jiggle_mj.estimator.membrane import EdgeMembrane
 from jiggle_mj.estimator.mesh import SheetMesh
-
-
-class Batch(eqx.Module):
-    """Distance constraints of one colour."""
-
-    vertices: Int[np.ndarray, "m 2"]
-    length: Float[Array, " m"]
-    """[m]."""
-    stiffness: Float[Array, " m"]
-    """[N/m]."""
 
 
 class XPBD(eqx.Module):
@@ -40,7 +30,7 @@ class XPBD(eqx.Module):
 
     rest: Float[Array, "n 3"]
     """Anchors of the boundary springs [m]."""
-    batches: tuple[Batch, ...]
+    batches: tuple[EdgeMembrane, ...]
     """C_m: edges and hinges, by colour."""
     inverse_mass: Float[Array, " n"]
     """[1/kg]."""
@@ -70,7 +60,7 @@ class XPBD(eqx.Module):
         """
         mass = areal_density * mesh.particle_area
         batches = tuple(
-            Batch(
+            EdgeMembrane(
                 vertices=np.asarray(spring.vertices)[colour],
                 length=spring.length[colour],
                 stiffness=spring.stiffness[colour],
@@ -158,7 +148,7 @@ class XPBD(eqx.Module):
         x, of_boundary = self._anchor(x, of_boundary, b)
         return x, (tuple(moved), of_grip, of_boundary)
 
-    def _stretch(self, x, multiplier, batch: Batch):
+    def _stretch(self, x, multiplier, batch: EdgeMembrane):
         """C = |x_1 - x_0| - l."""
         i, j = batch.vertices.T
         direction, distance = _direction(x[j] - x[i])
@@ -213,7 +203,6 @@ def colours(pairs: Int[np.ndarray, "m 2"], n: int) -> list[Int[np.ndarray, " _k"
 
 
 def _direction(d: Float[Array, "m 3"]) -> tuple[Float[Array, "m 3"], Float[Array, " m"]]:
-    """Unit vector and length, with a finite derivative where there is none."""
-    squared = jnp.sum(d**2, axis=1)
-    distance = jnp.sqrt(jnp.where(squared > 0, squared, jnp.finfo(d.dtype).tiny))
+    """Unit vector and length."""
+    distance = lengths(d)
     return d / distance[:, None], distance

@@ -5,6 +5,7 @@ written.
 """
 
 import platform
+from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import Disparity, TissueMask
 from jiggle_mj.eval.report import shown_steps, write_report
-from jiggle_mj.eval.score import IDENTITY, RECORDED, Json, result, score, write_result
+from jiggle_mj.eval.score import IDENTITY, RECORDED, Json, read_scorable, result, score_read, write_result
 
 from jiggle_mj.episode import (
     ESTIMATE,
@@ -35,7 +36,6 @@ from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.observation import StereoPair
 from jiggle_mj.recording import Recording
 from jiggle_mj.truth import Truth
-from jiggle_mj.truth_recording import read_truth
 
 if TYPE_CHECKING:
     from jiggle_mj.scenes import Scene
@@ -96,8 +96,8 @@ def run_scene(
         simulation_s=watch.seconds,
     )
     write_result(directory / RESULT, unscored)
-    scored = score(directory, truth_path(directory / RECORDING))
-    truth = read_truth(truth_path(directory / RECORDING))
+    unscored, found, truth = read_scorable(directory, truth_path(directory / RECORDING))
+    scored = score_read(directory, unscored, found, truth)
     _report(directory, episode, scored, recording=directory / RECORDING, truth=truth)
     return scored
 
@@ -152,34 +152,34 @@ def run_estimator(
     return figures
 
 
-def score_directory(directory: Path, truth: Path, *, recording: Path | None = None) -> Json:
+def score_directory(
+    directory: Path, truth: Path, *, recording: Path | None = None, say: Callable[[str], None] = lambda _: None
+) -> Json:
     """Score an estimate that lies in a folder, and write its report anew with the truth beside it.
 
     Args:
         directory: the folder.
         truth: the truth file.
-        recording: what was estimated, for the report's pictures; `find_recording` looks for it if None.
+        recording: what was estimated, for the report's pictures; if None, it is looked for beside the truth file and in
+            the folder.
+        say: told if the report loses its pictures.
 
     Raises:
         RecordingError: the folder holds no estimate, the file no truth, or one of another recording.
         OutputError: the estimate did not finish.
     """
-    read = read_estimate(directory / ESTIMATE) if (directory / ESTIMATE).exists() else None
-    if recording is not None and read is not None and not _is_of(read, recording):
+    unscored, found, true = read_scorable(directory, truth)
+    if recording is not None and not _is_of(found, recording):
         raise RecordingError(f"{recording} is not the recording that {directory} estimates.")
-    figures = score(directory, truth)
-    assert read is not None
-    recording = recording or find_recording(directory, truth)
-    _report(directory, read, figures, recording=recording, truth=read_truth(truth))
+    figures = score_read(directory, unscored, found, true)
+    if recording is None:
+        beside = truth.with_name(truth.name.replace(".truth.", "."))
+        candidates = (path for path in (beside, directory / RECORDING) if path != truth and path.exists())
+        recording = next((path for path in candidates if _is_of(found, path)), None)
+    if recording is None and figures["sensing"] == "stereo":
+        say("the recording is not beside the truth: the report has no pictures; pass --recording for them")
+    _report(directory, found, figures, recording=recording, truth=true)
     return figures
-
-
-def find_recording(directory: Path, truth: Path) -> Path | None:
-    """The recording that a folder estimates: beside the truth file, or the folder's run.mcap; None if neither is it."""
-    read = read_estimate(directory / ESTIMATE)
-    beside = truth.with_name(truth.name.replace(".truth.", "."))
-    candidates = (path for path in (beside, directory / RECORDING) if path != truth and path.exists())
-    return next((path for path in candidates if _is_of(read, path)), None)
 
 
 def _is_of(read: EstimateRecording, recording: Path) -> bool:

@@ -21,7 +21,7 @@ from jiggle_mj.eval.tracking import mean_boundary_energy, tracking
 
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
-from jiggle_mj.estimate_recording import read_estimate
+from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
 from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import read_truth
 
@@ -129,39 +129,55 @@ def with_truth(
     return scored
 
 
-def score(directory: Path, truth_path: Path) -> Json:
-    """Score DIR/estimate.mcap against a truth file, and write the figures into DIR/result.json.
-
-    All that `result.json` said before and the truth does not decide, above all the timing, is kept.
+def read_scorable(directory: Path, truth_path: Path) -> tuple[Json, EstimateRecording, Truth]:
+    """DIR/result.json, DIR/estimate.mcap and the truth, once it is clear that they belong together.
 
     Raises:
         OutputError: DIR has no readable `result.json`, or its estimate did not finish.
         RecordingError: a file is missing, damaged or of the wrong kind, or the truth is of another recording.
     """
     unscored = read_result(directory / "result.json")
-    recording = read_estimate(directory / "estimate.mcap")
-    if recording.belief is None or recording.detection is None:
+    found = read_estimate(directory / "estimate.mcap")
+    if found.belief is None or found.detection is None:
         raise OutputError(f"{directory / 'estimate.mcap'} ends before its belief; estimate the recording again.")
     truth = read_truth(truth_path)
-    if recording.metadata.get(RECORDED, truth.scene) != truth.scene:
+    if found.metadata.get(RECORDED, truth.scene) != truth.scene:
         raise RecordingError(
             f"{truth_path} is the truth of '{truth.scene}', and {directory} the estimate of "
-            f"'{recording.metadata[RECORDED]}'; give the truth of the same recording."
+            f"'{found.metadata[RECORDED]}'; give the truth of the same recording."
         )
-    estimated = recording.metadata.get(IDENTITY, "")
+    estimated = found.metadata.get(IDENTITY, "")
     if truth.identity and estimated and estimated != truth.identity:
         raise RecordingError(
             f"{truth_path} is the truth of another recording of '{truth.scene}' than {directory} estimates (another "
             "scene file, sensing or seed); give the truth that was written with it."
         )
-    if truth.frames and not {f.index for f in truth.frames} & {e.index for e in recording.estimates}:
+    if truth.frames and not {f.index for f in truth.frames} & {e.index for e in found.estimates}:
         raise RecordingError(f"{truth_path} shares no frame with {directory}; give the truth of the same recording.")
+    return unscored, found, truth
+
+
+def score(directory: Path, truth_path: Path) -> Json:
+    """Score DIR/estimate.mcap against a truth file, and write the figures into DIR/result.json; see `score_read`.
+
+    Raises:
+        JiggleError: what `read_scorable` raises.
+    """
+    return score_read(directory, *read_scorable(directory, truth_path))
+
+
+def score_read(directory: Path, unscored: Json, found: EstimateRecording, truth: Truth) -> Json:
+    """Score what was read, and write the figures into DIR/result.json.
+
+    All that `result.json` said before and the truth does not decide, above all the timing, is kept.
+    """
+    assert found.belief is not None and found.detection is not None
     figures = with_truth(
         unscored,
-        sheet=recording.sheet,
-        estimates=recording.estimates,
-        belief=recording.belief,
-        detection=recording.detection,
+        sheet=found.sheet,
+        estimates=found.estimates,
+        belief=found.belief,
+        detection=found.detection,
         truth=truth,
     )
     write_result(directory / "result.json", figures)

@@ -184,12 +184,9 @@ def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = N
             the folder.
         as_json: print result.json to stdout.
     """
-    from jiggle_mj.eval.experiment import find_recording, score_directory
+    from jiggle_mj.eval.experiment import score_directory
 
-    figures = score_directory(directory, truth, recording=recording)
-    if figures["sensing"] == "stereo" and not (recording or find_recording(directory, truth)):
-        console.print("the recording is not beside the truth: the report has no pictures; pass --recording for them")
-    _show(figures, directory, as_json)
+    _show(score_directory(directory, truth, recording=recording, say=console.print), directory, as_json)
 
 
 def table(

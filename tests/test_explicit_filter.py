@@ -64,7 +64,7 @@ def test_an_update_is_the_papers_equations(lift):
     """Three stacked samples against K = Sigma J^T (J Sigma J^T + V)^-1 in covariance form, J by finite differences."""
     belief = BoundaryBelief.prior(MESH.n, mean=0.5, sd=1.0)
     three = stacked([lift[1], lift[8], lift[5]])
-    after, nis = update(SIMULATOR, belief, three, sweeps=SWEEPS)
+    after, _, nis = update(SIMULATOR, belief, three, sweeps=SWEEPS)
     found_mean, found_covariance = after.moments()
 
     mean, covariance = (np.asarray(part) for part in belief.moments())

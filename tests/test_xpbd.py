@@ -13,7 +13,7 @@ from jiggle_mj.estimator.environment import Grip, Weight
 from jiggle_mj.estimator.equilibrium import equilibrium
 from jiggle_mj.estimator.membrane import EdgeMembrane
 from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.xpbd import XPBD, Batch, colours, hinge_springs
+from jiggle_mj.estimator.xpbd import XPBD, colours, hinge_springs
 from small_sheet import equilateral, jittered, search
 
 K, BEND, TIME_STEP = 30.0, 1.0, 0.02
@@ -78,7 +78,7 @@ def test_one_spring_moves_as_implicit_euler_says():
 
 
 def one_spring(length: float, stiffness: float):
-    return (Batch(vertices=np.array([[0, 1]]), length=jnp.array([length]), stiffness=jnp.array([stiffness])),)
+    return (EdgeMembrane(vertices=np.array([[0, 1]]), length=jnp.array([length]), stiffness=jnp.array([stiffness])),)
 
 
 def test_colours_hold_each_spring_once_and_no_particle_twice():

@@ -59,9 +59,7 @@ class Shots(eqx.Module):
 class MultipleShooting:
     """The filter for one sheet, with the samples so far."""
 
-    def __init__(
-        self, mesh: SheetMesh, declaration: Declaration, *, grip_stiffness: float, samples: int, seed: int = 0
-    ) -> None:
+    def __init__(self, mesh: SheetMesh, declaration: Declaration, *, grip_stiffness: float, samples: int) -> None:
         """Build the simulator.
 
         Args:
@@ -69,13 +67,12 @@ class MultipleShooting:
             declaration: its membrane stiffness and areal density are used.
             grip_stiffness: of the springs to the tip [N/m].
             samples: k.
-            seed: draws the samples.
         """
         k = declaration.membrane_stiffness
         springs = EdgeMembrane.build(mesh, stiffness=k), hinge_springs(mesh, stiffness=HINGE * k)
         self._simulator = XPBD.build(mesh, springs, areal_density=declaration.areal_density, time_step=TIME_STEP)
         self._grip_stiffness, self._samples = grip_stiffness, samples
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(0)
         self._history: list[Shots] = []
 
     def update(
@@ -92,12 +89,11 @@ class MultipleShooting:
         empty = eqx.tree_at(lambda shot: shot.precision, self._history[-1], replace_fn=jnp.zeros_like)
         chosen += [empty] * (self._samples - len(chosen))
         shots = jax.tree.map(lambda *parts: jnp.concatenate(parts), *chosen)
-        belief, nis = update(self._simulator, belief, shots, sweeps=SWEEPS)
-        factor = jnp.linalg.cholesky(belief.precision)
+        belief, factor, nis = update(self._simulator, belief, shots, sweeps=SWEEPS)
         return Update(
             belief=belief,
             x=evidence.y,
-            b=jnp.maximum(belief.mean(), 0),
+            b=jnp.maximum(cho_solve((factor, True), belief.shift), 0),
             sd=standard_deviations(factor),
             entropy=entropy(factor),
             nis=nis,
@@ -107,8 +103,8 @@ class MultipleShooting:
 @eqx.filter_jit
 def update(
     simulator: XPBD, belief: BoundaryBelief, shots: Shots, *, sweeps: int
-) -> tuple[BoundaryBelief, Float[Array, ""]]:
-    """The belief after all samples at once, and the innovation squared per degree of freedom before it."""
+) -> tuple[BoundaryBelief, Float[Array, "n n"], Float[Array, ""]]:
+    """The belief after all samples at once, its precision's Cholesky factor, and the squared innovation per dof."""
     mean = belief.mean()
     b = jnp.maximum(mean, 0)
     columns = jnp.eye(len(b), dtype=b.dtype)
@@ -127,9 +123,10 @@ def update(
 
     gained, pulled, squared = (jnp.sum(part, axis=0) for part in jax.lax.map(one, shots))
     after = belief.add(gained, pulled + gained @ mean)
-    explained = pulled @ cho_solve((jnp.linalg.cholesky(after.precision), True), pulled)
+    factor = jnp.linalg.cholesky(after.precision)
+    explained = pulled @ cho_solve((factor, True), pulled)
     observed = 3 * jnp.sum(jnp.trace(shots.precision, axis1=2, axis2=3) > 0)
-    return after, (squared - explained) / jnp.maximum(observed, 1).astype(b.dtype)
+    return after, factor, (squared - explained) / jnp.maximum(observed, 1).astype(b.dtype)
 
 
 def draw_samples(latest: int, since: int, k: int, rng: np.random.Generator) -> Int[np.ndarray, " _k"]:

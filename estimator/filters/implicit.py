@@ -83,14 +83,7 @@ class ImplicitFilter(eqx.Module):
     def update(
         self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:
-        """Take one frame into the belief.
-
-        Args:
-            belief: before the frame.
-            b: its non-negative mean [N/m].
-            evidence: what was seen.
-            start: where the search for the state begins [m].
-        """
+        """See `Filter.update`; the search for the state begins at `start`."""
         frame = self._approach(self._settle(start, b, evidence), b, evidence)
         residual, whitened = self._residual(frame)
         gained, shift = self._information(frame, b, whitened)
