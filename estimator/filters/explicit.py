@@ -68,9 +68,7 @@ class MultipleShooting:
             grip_stiffness: of the springs to the tip [N/m].
             samples: k.
         """
-        k = declaration.membrane_stiffness
-        springs = EdgeMembrane.build(mesh, stiffness=k), hinge_springs(mesh, stiffness=HINGE * k)
-        self._simulator = XPBD.build(mesh, springs, areal_density=declaration.areal_density, time_step=TIME_STEP)
+        self._simulator = simulator(mesh, declaration)
         self._grip_stiffness, self._samples = grip_stiffness, samples
         self._rng = np.random.default_rng(0)
         self._history: list[Shots] = []
@@ -98,6 +96,13 @@ class MultipleShooting:
             entropy=entropy(factor),
             nis=nis,
         )
+
+
+def simulator(mesh: SheetMesh, declaration: Declaration) -> XPBD:
+    """The paper's f for a sheet: springs on edges and across hinges."""
+    k = declaration.membrane_stiffness
+    springs = EdgeMembrane.build(mesh, stiffness=k), hinge_springs(mesh, stiffness=HINGE * k)
+    return XPBD.build(mesh, springs, areal_density=declaration.areal_density, time_step=TIME_STEP)
 
 
 @eqx.filter_jit
