@@ -14,9 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.filters.adam import AdamShooting
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
 from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
+from jiggle_mj.estimator.filters.unscented import ReducedUnscented
 from jiggle_mj.estimator.grip import GripHold
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.perception import Disparity, PointTracker, StereoTracker, TissueMask, Track
@@ -30,7 +33,7 @@ from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
-FilterName = Literal["implicit", "explicit"]
+FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,11 +43,12 @@ class EstimatorConfig:
     spacing: float = 4.4e-3
     """Between the particles of a mesh laid over images [m]."""
     filter: FilterName = "implicit"
-    """How a frame enters the belief: through the balance of forces, or, as in the paper, through a simulated step."""
+    """How a frame enters the belief: through the balance of forces, or, as in the paper, through a simulated step; the
+    others are baselines: gradient descent on that step, least squares on the forces, and patches through equilibria."""
     samples: int = 1
-    """Frames that each update of the explicit filter simulates, the latest among them."""
+    """Frames that each update of the explicit filter or of adam simulates, the latest among them."""
     membrane: Membrane = "triangles"
-    """Law of the sheet's plane, for the implicit filter: St Venant-Kirchhoff triangles, or springs along the edges."""
+    """Law of the sheet's plane where no step is simulated: St Venant-Kirchhoff triangles, or springs along edges."""
     prior_sd: float = 1 / 75
     """Standard deviation of each attachment stiffness before anything is seen [k]."""
     force_sd: float = 4.5e-3
@@ -62,7 +66,7 @@ class EstimatorConfig:
             if not getattr(self, name) > 0:
                 raise ValueError(f"EstimatorConfig.{name} must be above 0; got {getattr(self, name)}.")
         if self.filter not in get_args(FilterName):
-            raise ValueError(f"EstimatorConfig.filter must be 'implicit' or 'explicit'; got {self.filter!r}.")
+            raise ValueError(f"EstimatorConfig.filter must be one of {get_args(FilterName)}; got {self.filter!r}.")
         if not (isinstance(self.samples, int) and self.samples >= 1):
             raise ValueError(f"EstimatorConfig.samples must be an integer of at least 1; got {self.samples}.")
         if self.membrane not in ("triangles", "edges"):
@@ -237,19 +241,25 @@ class Estimator:
             self._sheet = self._points.start(self._still)
         mesh, k = SheetMesh(self._sheet.rest, self._sheet.faces), self.declaration.membrane_stiffness
         self._field = MeshField(SheetPlane.through(mesh.rest).flatten(mesh.rest), mesh.faces)
-        explicit = self.config.filter == "explicit"
-        self._belief = BoundaryBelief.prior(mesh.n, mean=PRIOR_MEAN if explicit else 0.0, sd=self.config.prior_sd * k)
+        prior_mean = PRIOR_MEAN if self.config.filter == "explicit" else 0.0
+        self._belief = BoundaryBelief.prior(mesh.n, mean=prior_mean, sd=self.config.prior_sd * k)
         self.prior_entropy = float(self._belief.entropy())
         self._x, self._b = mesh.rest, np.zeros(mesh.n)
-        if explicit:
-            stiffness = self.config.grip_stiffness * k
-            return MultipleShooting(mesh, self.declaration, grip_stiffness=stiffness, samples=self.config.samples)
-        return ImplicitFilter.build(
-            mesh,
-            surrogate(mesh, self.declaration, membrane=self.config.membrane),
-            force_sd=self.config.force_sd * k * mesh.spacing,
-            grip_stiffness=self.config.grip_stiffness * k,
-        )
+        return self._build(mesh)
+
+    def _build(self, mesh: SheetMesh) -> Filter:
+        """The filter that the settings name."""
+        config, k = self.config, self.declaration.membrane_stiffness
+        grip_stiffness, force_sd = config.grip_stiffness * k, config.force_sd * k * mesh.spacing
+        if config.filter in ("explicit", "adam"):
+            shooting = MultipleShooting if config.filter == "explicit" else AdamShooting
+            return shooting(mesh, self.declaration, grip_stiffness=grip_stiffness, samples=config.samples)
+        energy = surrogate(mesh, self.declaration, membrane=config.membrane)
+        if config.filter == "nnls":
+            return NonNegativeLeastSquares.build(energy, force_sd=force_sd)
+        if config.filter == "unscented":
+            return ReducedUnscented(mesh, energy, grip_stiffness=grip_stiffness, force_tolerance=force_sd / 4)
+        return ImplicitFilter.build(mesh, energy, force_sd=force_sd, grip_stiffness=grip_stiffness)
 
     def _see(self, observation: Observation) -> Track:
         if observation.images is not None and self._stereo is not None:

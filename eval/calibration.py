@@ -2,7 +2,7 @@
 
 The Gaussian before the non-negativity constraint is judged, since that is what the filter propagates. Particles whose
 true stiffness is no number (a weld, or attached by an unknown amount) are marginalised out, which for a Gaussian means
-dropping their rows and columns.
+dropping their rows and columns; so are those whose variance is not stated (NaN: an estimator without uncertainty).
 
 NEES is the normalised estimation error squared of Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to
 Tracking and Navigation" (2001); divided by the degrees of freedom it is 1 on average for an honest belief, above 1 for
@@ -36,12 +36,12 @@ class Calibration:
 
 
 def nees_per_dof(belief: Belief, stiffness: Float[np.ndarray, " n"]) -> float | None:
-    """(b_hat - b*)^T Sigma^-1 (b_hat - b*) / n over the particles whose b* is finite, in float64.
+    """(b_hat - b*)^T Sigma^-1 (b_hat - b*) / n over the particles whose b* and variance are finite, in float64.
 
     Raises:
         ValueError: the covariance is not positive definite.
     """
-    known = np.isfinite(stiffness)
+    known = np.isfinite(stiffness) & np.isfinite(np.diagonal(belief.covariance))
     if not known.any():
         return None
     error = belief.mean[known].astype(np.float64) - stiffness[known]
@@ -57,8 +57,8 @@ def nees_per_dof(belief: Belief, stiffness: Float[np.ndarray, " n"]) -> float | 
 
 
 def coverage(belief: Belief, stiffness: Float[np.ndarray, " n"], level: float = LEVEL) -> float | None:
-    """Share of the particles of finite b* with |b_hat - b*| <= z sd, z the two-sided normal quantile of `level`."""
-    known = np.isfinite(stiffness)
+    """Share of particles of finite b* and variance with |b_hat - b*| <= z sd, z the two-sided normal quantile."""
+    known = np.isfinite(stiffness) & np.isfinite(np.diagonal(belief.covariance))
     if not known.any():
         return None
     half_width = ndtri((1 + level) / 2) * np.sqrt(np.diagonal(belief.covariance)[known])

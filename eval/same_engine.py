@@ -23,7 +23,7 @@ from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
-from jiggle_mj.estimator.filters.explicit import SWEEPS, simulator
+from jiggle_mj.estimator.filters.shots import SWEEPS, simulator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.surrogate import surrogate
 from jiggle_mj.scenes import Scene, programme

@@ -66,7 +66,7 @@ def measure(
         found[row] = []
         for seed in seeds:
             folder = directory / f"{row.scene}-{row.sensing}-{seed}"
-            done = _scored(folder)
+            done = finished(folder, EstimatorConfig())
             if done is None:
                 say(f"{row.scene}, {row.sensing}, seed {seed}")
                 done = run_scene(load_scene(row.scene), folder, seed=seed, sensing=row.sensing, overwrite=True)
@@ -81,29 +81,31 @@ def markdown(results: dict[Row, list[Json]]) -> str:
         "|" + "---|" * (len(FIGURES) + 2),
     ]
     for row, runs in results.items():
-        cells = [_cell([_value(run, path) for run in runs], factor, digits) for _, path, factor, digits in FIGURES]
+        cells = [cell([value(run, path) for run in runs], factor, digits) for _, path, factor, digits in FIGURES]
         lines.append(f"| {row.scene} | {row.sensing} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def _scored(folder: Path) -> Json | None:
-    """The result of a finished run with this version and the default settings."""
+def finished(folder: Path, config: EstimatorConfig) -> Json | None:
+    """The result of a run that was scored, with this version and these settings; None if there is none."""
     if not (folder / RESULT).exists():
         return None
     figures, made_with = read_result(folder / RESULT), read_estimate(folder / ESTIMATE).metadata
-    expected = settings(EstimatorConfig()) | {VERSION: file_metadata()[VERSION]}
+    expected = settings(config) | {VERSION: file_metadata()[VERSION]}
     current = all(made_with.get(name) == value for name, value in expected.items())
-    return figures if current and _value(figures, ("detection", "n_attached")) is not None else None
+    return figures if current and value(figures, ("detection", "n_attached")) is not None else None
 
 
-def _value(run: Json, path: tuple[str, ...]) -> float | None:
-    value: object = run
+def value(run: Json, path: tuple[str, ...]) -> float | None:
+    """The figure at a place of result.json; None where it is null or missing."""
+    found: object = run
     for key in path:
-        value = value[key] if isinstance(value, dict) else None
-    return None if value is None else float(str(value))
+        found = found[key] if isinstance(found, dict) else None
+    return None if found is None else float(str(found))
 
 
-def _cell(values: list[float | None], factor: float, digits: int) -> str:
+def cell(values: list[float | None], factor: float, digits: int) -> str:
+    """Mean and range of the values that are known."""
     known = factor * np.array([value for value in values if value is not None])
     if not len(known):
         return "–"  # noqa: RUF001  # a dash of its own for 'not defined'

@@ -53,9 +53,10 @@ def stiffness_sums(sheet: Sheet, belief: Belief, last: Estimate, carried: Carrie
         return ""
     near = dilate(carried.attached, sheet.faces, 1)
     sd = float(np.sqrt(belief.covariance[np.ix_(near, near)].sum()))
+    stated = f"a stated standard deviation of {sd:.1f}" if np.isfinite(sd) else "no stated deviation"
     return (
-        f"Over these and one ring around them b sums to {last.mean[near].sum():.1f} N/m, with a stated standard "
-        f"deviation of {sd:.1f}; the truth is {carried.stiffness[near].sum():.1f}."
+        f"Over these and one ring around them b sums to {last.mean[near].sum():.1f} N/m, with {stated}; the truth is "
+        f"{carried.stiffness[near].sum():.1f}."
     )
 
 

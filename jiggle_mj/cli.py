@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jiggle_mj.observation import Observation
 
 Sensing = Literal["stereo", "points", "particles"]
-FilterName = Literal["implicit", "explicit"]
+FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
 PathArgument = Annotated[Path, tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -51,7 +51,7 @@ def run(
         scene: a shipped scene (arc, line, ...) or the path of a scene file.
         out: folder for run.mcap, run.truth.mcap, estimate.mcap, result.json and report.html.
         sensing: what the estimator sees: images; noisy tracked points of the tissue; noisy vertices of the reference.
-        estimator: implicit is ours; explicit is the paper's filter.
+        estimator: implicit is ours; explicit is the paper's filter, adam its baseline; nnls and unscented are others'.
         seed: of the sensing noise.
         overwrite: replace results that are already in the folder, from the moment that the run begins.
         as_json: print result.json to stdout.
@@ -152,7 +152,7 @@ def estimate(
     Args:
         recording: an MCAP file.
         out: folder for estimate.mcap, result.json and report.html.
-        estimator: implicit is ours; explicit is the paper's filter.
+        estimator: implicit is ours; explicit is the paper's filter, adam its baseline; nnls and unscented are others'.
         allow_truncated: use what is whole of a recording that was cut off.
         overwrite: replace results that are already in the folder.
         as_json: print result.json to stdout.
@@ -190,19 +190,29 @@ def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = N
 
 
 def table(
-    name: Annotated[Literal["main"], tyro.conf.Positional], /, *, out: Out, seeds: tuple[int, ...] = (0, 1, 2)
+    name: Annotated[Literal["main", "simulation", "one-lift"], tyro.conf.Positional],
+    /,
+    *,
+    out: Out,
+    seeds: tuple[int, ...] | None = None,
 ) -> None:
     """Run a table of scenes and seeds, and print it as Markdown; what is in OUT already is not run again.
 
     Args:
-        name: main is the README's.
+        name: main is the README's; simulation and one-lift are the paper's, with its printed figures and all baselines.
         out: holds a folder for each run.
-        seeds: of each row.
+        seeds: of each row; 0 to 2 for main and 0 to 9 for the paper's if left out.
     """
-    from jiggle_mj.eval.tables import MAIN, markdown, measure
+    from jiggle_mj.eval import paper_tables, tables
 
-    rows = {"main": MAIN}[name]
-    print(markdown(measure(rows, seeds, out, say=lambda text: console.print(text, highlight=False))))
+    def say(text: str) -> None:
+        console.print(text, highlight=False)
+
+    if name == "main":
+        print(tables.markdown(tables.measure(tables.MAIN, seeds or range(3), out, say=say)))
+    else:
+        table, cells = paper_tables.TABLES[name], paper_tables.cells()
+        print(paper_tables.markdown(table, paper_tables.measure(table, cells, seeds or range(10), out, say=say)))
 
 
 def doctor(*, as_json: AsJson = False) -> None:

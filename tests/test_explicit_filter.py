@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.environment import Grip
-from jiggle_mj.estimator.filters.explicit import Shots, draw_samples, update
+from jiggle_mj.estimator.filters.evidence import Evidence, Pull
+from jiggle_mj.estimator.filters.explicit import non_negative, update
+from jiggle_mj.estimator.filters.shots import History, Shots, draw_samples
 from jiggle_mj.estimator.membrane import EdgeMembrane
 from jiggle_mj.estimator.xpbd import XPBD, hinge_springs
 from small_sheet import GRIP_RADIUS, equilateral, jittered
@@ -19,8 +21,9 @@ NOISE, STIFFNESS = 1e-4, 3.0
 ATTACHED = np.linalg.norm(MESH.rest, axis=1) < 9e-3
 
 
-def updated(belief: BoundaryBelief, shots: Shots) -> BoundaryBelief:
-    return update(SIMULATOR, belief, shots, sweeps=SWEEPS)[0]
+def updated(belief: BoundaryBelief, shots: Shots, b: jax.Array | None = None) -> BoundaryBelief:
+    """Linearised at b, by default at the mean where that is not negative."""
+    return update(SIMULATOR, belief, jnp.maximum(belief.mean(), 0) if b is None else b, shots, sweeps=SWEEPS)[0]
 
 
 def shots(truth: np.ndarray, seed: int) -> list[Shots]:
@@ -64,7 +67,7 @@ def test_an_update_is_the_papers_equations(lift):
     """Three stacked samples against K = Sigma J^T (J Sigma J^T + V)^-1 in covariance form, J by finite differences."""
     belief = BoundaryBelief.prior(MESH.n, mean=0.5, sd=1.0)
     three = stacked([lift[1], lift[8], lift[5]])
-    after, _, nis = update(SIMULATOR, belief, three, sweeps=SWEEPS)
+    after, _, nis = update(SIMULATOR, belief, belief.mean(), three, sweeps=SWEEPS)
     found_mean, found_covariance = after.moments()
 
     mean, covariance = (np.asarray(part) for part in belief.moments())
@@ -96,18 +99,54 @@ def test_a_missing_particle_has_no_influence(lift):
     np.testing.assert_allclose(updated(belief, one).shift, updated(belief, other).shift, rtol=1e-12)
 
 
+def filtered(samples: list[Shots]) -> tuple[BoundaryBelief, np.ndarray]:
+    """One sample a frame, from the paper's prior mean, each linearised at the constrained mean."""
+    belief, b = BoundaryBelief.prior(MESH.n, mean=1e-4, sd=3.0), jnp.zeros(MESH.n)
+    for sample in samples:
+        belief = updated(belief, sample, b)
+        b = non_negative(belief, b)
+    return belief, np.asarray(b)
+
+
 def test_attached_particles_rank_above_all_others_on_its_own_simulator(lift):
-    """From the paper's prior mean, one sample a frame. Shrunk by the prior and by noise in x_m that f takes for true,
-    so a threshold at half the truth would miss some."""
-    belief = BoundaryBelief.prior(MESH.n, mean=1e-4, sd=1.0)
-    for sample in lift:
-        belief = updated(belief, sample)
-    mean = np.asarray(belief.mean())
+    """Shrunk by the prior and by noise in x_m that f ignores, so a threshold at half the truth would miss some."""
+    mean = filtered(lift)[1]
     assert mean[ATTACHED].min() > 2 * mean[~ATTACHED].max()
 
 
+def test_the_belief_is_honest_within_an_order_on_its_own_simulator(lift):
+    """NEES per degree of freedom; it was in the thousands while f(b >= 0) was compared with what belongs to b < 0."""
+    mean, covariance = (np.asarray(part) for part in filtered(lift)[0].moments())
+    error = mean - STIFFNESS * ATTACHED
+    assert 0.1 < error @ np.linalg.solve(covariance, error) / MESH.n < 10
+
+
+def test_the_point_of_linearisation_does_not_count_as_news(lift):
+    """Where J is nil, as at rest with the jaws still, the belief stays as it was, wherever f is taken."""
+    still = eqx.tree_at(lambda s: (s.start, s.end), lift[0], (jnp.asarray(MESH.rest)[None],) * 2)
+    still = eqx.tree_at(lambda s: s.stiffness, still, replace_fn=jnp.zeros_like)
+    belief = BoundaryBelief.prior(MESH.n, mean=-0.5, sd=1.0)
+    np.testing.assert_allclose(updated(belief, still).mean(), belief.mean(), atol=1e-9)
+
+
 def test_the_latest_sample_is_always_drawn_and_none_from_before_the_cut():
-    drawn = [draw_samples(9, 4, 3, np.random.default_rng(seed)) for seed in range(50)]
-    assert all(one[-1] == 9 and len(set(one.tolist())) == 3 for one in drawn)
-    assert set(np.concatenate(drawn).tolist()) == {4, 5, 6, 7, 8, 9}
-    assert draw_samples(4, 4, 3, np.random.default_rng(0)).tolist() == [4]
+    drawn = [draw_samples(5, 3, np.random.default_rng(seed)) for seed in range(50)]
+    assert all(one[-1] == 5 and len(set(one.tolist())) == 3 for one in drawn)
+    assert set(np.concatenate(drawn).tolist()) == {0, 1, 2, 3, 4, 5}
+    assert draw_samples(0, 3, np.random.default_rng(0)).tolist() == [0]
+
+    history = History(grip_stiffness=90.0, samples=3)
+    for height in (1.0, 2.0, 3.0):
+        history.add(step(height))
+    history.forget()
+    after = [history.add(step(height)) for height in (4.0, 5.0)]
+    heights = [np.asarray(one.tip)[np.asarray(one.precision).any(axis=(1, 2, 3)), 2].tolist() for one in after]
+    assert heights == [[4.0], [4.0, 5.0]]
+
+
+def step(height: float) -> Evidence:
+    """A frame that is told by the height of the tip."""
+    one, x = np.ones(MESH.n, bool), jnp.asarray(MESH.rest)
+    pull = Pull(before=x, tip=jnp.asarray([0.0, 0.0, height]), length=jnp.ones(MESH.n))
+    precision = jnp.broadcast_to(jnp.eye(3), (MESH.n, 3, 3))
+    return Evidence(y=x, precision=precision, held=jnp.asarray(one), loaded=jnp.asarray(one), pull=pull)

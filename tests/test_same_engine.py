@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.environment import Grip
-from jiggle_mj.estimator.filters.explicit import SWEEPS, simulator
+from jiggle_mj.estimator.filters.shots import SWEEPS, simulator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.surrogate import surrogate
 from jiggle_mj.eval.metrics import agreement
-from jiggle_mj.eval.same_engine import FORCE_TOLERANCE, INCREMENTS, NOISE, SameEngine, same_engine
+from jiggle_mj.eval.same_engine import FORCE_TOLERANCE, INCREMENTS, NOISE, SameEngine, same_engine, sheet
 from jiggle_mj.scenes import load_scene
 from jiggle_mj.scenes.attachments import Disc
 from jiggle_mj.scenes.scene import Scene, Tissue
@@ -78,7 +78,5 @@ def test_our_filter_finds_the_attachments_of_its_own_engine():
 
 def test_shapes_and_counts_are_the_scenes():
     """The attached vertices are those of the scene's own tissue."""
-    from jiggle_mj.eval.same_engine import sheet
-
     mesh, attached = sheet(load_scene("arc"))
     assert mesh.n == 611 and attached.sum() == 52

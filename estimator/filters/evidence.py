@@ -33,7 +33,7 @@ class Evidence(eqx.Module):
 
 
 class Update(eqx.Module):
-    """The outcome of one frame."""
+    """The outcome of one frame; a filter without uncertainty gives a belief, sd, entropy and nis of NaN: not stated."""
 
     belief: BoundaryBelief
     x: Float[Array, "n 3"]

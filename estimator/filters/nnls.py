@@ -1,0 +1,70 @@
+"""Non-negative least squares on the springs, the interior-point line of work [Xu et al. 2022, the paper's reference].
+
+At an observed state x the balance of forces is linear in b, so that over all frames
+
+    min over b >= 0 of   sum_t sum_i tau^-2 |grad_i U(x_t) + b_i (x_t,i - a_i)|^2  +  |b - mean_0|^2 / sd_0^2,
+
+particles that the grip may load left out. No noise of the positions enters: x_t is the equilibrium of the sheet on
+springs to what was observed, since the raw positions' own noise would drown the forces. The last term only decides for
+particles that never moved; it is the prior that all filters share. The uncertainty is that of the least squares, for
+forces that are wrong by tau independently.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
+from jiggle_mj.estimator.energy import SheetEnergy
+from jiggle_mj.estimator.environment import Tether
+from jiggle_mj.estimator.equilibrium import equilibrium
+from jiggle_mj.estimator.filters.evidence import Evidence, Update
+
+
+class NonNegativeLeastSquares(eqx.Module):
+    """The regression for one sheet; the frames so far are in the belief."""
+
+    energy: SheetEnergy
+    tethered: SheetEnergy
+    """The same, with springs to the observed positions as its last term."""
+    force_sd: Float[Array, ""]
+    """tau [N]."""
+
+    @classmethod
+    def build(cls, energy: SheetEnergy, *, force_sd: float) -> "NonNegativeLeastSquares":
+        """For a sheet's energy without attachments; force_sd [N]."""
+        rest = np.asarray(energy.rest)
+        tethered = SheetEnergy.build(rest, (*energy.terms, Tether.build(rest)), energy.layout)
+        return cls(energy=energy, tethered=tethered, force_sd=jnp.asarray(force_sd, dtype=float))
+
+    @eqx.filter_jit
+    def update(
+        self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
+    ) -> Update:
+        """See `Filter.update`; the search for the smooth state begins at `start`, with springs b."""
+        x = self._smooth(b, evidence, start)
+        weight = jnp.where(evidence.loaded, 0.0, self.force_sd**-2)
+        d, force = x - self.energy.rest, self.energy.gradient(x, jnp.zeros_like(b))
+        gained, pulled = weight * jnp.sum(d**2, axis=1), -weight * jnp.sum(d * force, axis=1)
+        mean = belief.mean()
+        innovation = weight * jnp.sum((force + mean[:, None] * d) ** 2, axis=1)
+        after = belief.add(jnp.diag(gained), pulled)
+        factor = jnp.linalg.cholesky(after.precision)
+        step = pulled - gained * mean
+        explained = jnp.sum(step**2 / jnp.diagonal(after.precision))
+        degrees = 3 * jnp.maximum(jnp.sum(weight > 0), 1).astype(b.dtype)
+        return Update(
+            belief=after,
+            x=x,
+            b=after.non_negative_mean(b > 0),
+            sd=standard_deviations(factor),
+            entropy=entropy(factor),
+            nis=(jnp.sum(innovation) - explained) / degrees,
+        )
+
+    def _smooth(self, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """The sheet on springs that pull with tau where it is one standard deviation off."""
+        sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), 1e-12))
+        pull = (self.force_sd * sd)[:, None, None] * evidence.precision
+        tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
+        return equilibrium(tethered, b, start, force_tolerance=self.force_sd / 4, max_steps=25).x

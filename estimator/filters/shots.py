@@ -1,0 +1,89 @@
+"""Multiple shooting with a horizon of one step, as in the paper: samples of the trajectory, and the f they restart.
+
+A sample is one step of the tool: the state before, the tip, and what was observed after. M = {m_1, ..., m_k} holds the
+latest step and k - 1 others, drawn uniformly from those since t_c, the last cut or suture.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from jiggle_mj.estimator.environment import Grip
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.membrane import EdgeMembrane
+from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.xpbd import XPBD, hinge_springs
+
+from jiggle_mj.observation import Declaration
+
+HINGE = 1 / 30
+"""Stiffness of the springs across hinges [membrane stiffness]."""
+TIME_STEP, SWEEPS = 0.02, 20
+"""Of f [s], and Gauss-Seidel sweeps."""
+
+
+class Shots(eqx.Module):
+    """Samples of the trajectory, each of one step."""
+
+    start: Float[Array, "k n 3"]
+    """x_m, the particles before the step [m]."""
+    tip: Float[Array, "k 3"]
+    """u_m, where the tip moved [m]."""
+    length: Float[Array, "k n"]
+    """Rest length of each particle's spring to the tip [m]."""
+    stiffness: Float[Array, "k n"]
+    """Of those springs, zero for particles that are not held [N/m]."""
+    end: Float[Array, "k n 3"]
+    """x_m+1, what was observed after it; anything finite where nothing was [m]."""
+    precision: Float[Array, "k n 3 3"]
+    """Inverse covariance of `end`, zero where nothing was observed [1/m^2]."""
+
+
+class History:
+    """The samples since t_c; remembers, so that it belongs to one filter."""
+
+    def __init__(self, *, grip_stiffness: float, samples: int) -> None:
+        """See `MultipleShooting`."""
+        self._grip_stiffness, self._samples = grip_stiffness, samples
+        self._rng = np.random.default_rng(0)
+        self._shots: list[Shots] = []
+
+    def add(self, evidence: Evidence) -> Shots:
+        """Keep the latest step, and draw M; fewer than k are filled up with samples of no weight.
+
+        Raises:
+            ValueError: the evidence does not say which step led to the frame.
+        """
+        pull = evidence.pull
+        if pull is None:
+            raise ValueError("multiple shooting needs Evidence.pull, the step that led to the frame; got None.")
+        stiffness = jnp.where(evidence.held, self._grip_stiffness, 0.0)
+        parts = (pull.before, pull.tip, pull.length, stiffness, evidence.y, evidence.precision)
+        self._shots.append(Shots(*(part[None] for part in parts)))
+        chosen = [self._shots[m] for m in draw_samples(len(self._shots) - 1, self._samples, self._rng)]
+        empty = eqx.tree_at(lambda shot: shot.precision, self._shots[-1], replace_fn=jnp.zeros_like)
+        chosen += [empty] * (self._samples - len(chosen))
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *chosen)
+
+    def forget(self) -> None:
+        """Set t_c to now: no later update draws a step from before."""
+        self._shots.clear()
+
+
+def simulator(mesh: SheetMesh, declaration: Declaration) -> XPBD:
+    """The paper's f for a sheet: springs on edges and across hinges, no weight and no bed."""
+    k = declaration.membrane_stiffness
+    springs = EdgeMembrane.build(mesh, stiffness=k), hinge_springs(mesh, stiffness=HINGE * k)
+    return XPBD.build(mesh, springs, areal_density=declaration.areal_density, time_step=TIME_STEP)
+
+
+def predicted(simulator: XPBD, shot: Shots, b: Float[Array, " n"], *, sweeps: int) -> Float[Array, "n 3"]:
+    """f(x_m, u_m, b) of one sample, whose arrays lack the leading axis."""
+    grip = Grip(vertices=np.arange(len(b))[:, None], tip=shot.tip, length=shot.length, stiffness=shot.stiffness)
+    return simulator.step(shot.start, b, grip, sweeps=sweeps)
+
+
+def draw_samples(latest: int, k: int, rng: np.random.Generator) -> Int[np.ndarray, " _k"]:
+    """The latest step and k - 1 earlier ones, uniformly, as far as there are any."""
+    return np.append(rng.choice(latest, size=min(k - 1, latest), replace=False), latest).astype(int)
