@@ -197,12 +197,15 @@ def markdown(table: PaperTable, results: dict[Cell, list[Json]]) -> str:
 def settings_in_words(table: PaperTable, seeds: list[str]) -> str:
     """What the table was made with."""
     common = EstimatorConfig()
-    return (
-        f"Mean (lowest…highest) over the seeds {', '.join(seeds)}, which draw the noise of {NOISE * 1e3:g} mm; corners "
-        f"lifted: {table.grasps}. k: membrane stiffness. xpbd and equilibrium: the scene's mesh, b* = "
-        f"{STIFFNESS:g} k, lifts of {HEIGHT:g} of the width in {INCREMENTS} moves, each from rest; mujoco: the scene "
-        f"as shipped. Reported attached above {RULE:g} b*. Prior sd {common.prior_sd:.3g} k, force sd {common.force_sd:g} "
-        f"k x spacing, {common.samples} sample a frame; f: dt = {shots.TIME_STEP:g} s, {shots.SWEEPS} sweeps, hinges "
-        f"{shots.HINGE:.3g} k; Adam: rate {adam.RATE:g} k, {adam.STEPS} steps a frame; {unscented.PATCHES} patches. "
-        "Printed: one run each, b* = 0.1 and b_thresh = 0.05 without unit, no noise stated."
+    return "\n".join(
+        (
+            f"Mean (lowest…highest) over the seeds {', '.join(seeds)}, which draw the noise of {NOISE * 1e3:g} mm.",
+            f"Corners lifted: {table.grasps}. k: membrane stiffness.",
+            f"xpbd, equilibrium: the scene's mesh, b* = {STIFFNESS:g} k,",
+            f"lifts of {HEIGHT:g} of the width in {INCREMENTS} moves, each from rest. mujoco: the scene as shipped.",
+            f"Attached: above {RULE:g} b*. Prior sd {common.prior_sd:.3g} k, force sd {common.force_sd:g} k x spacing,",
+            f"{common.samples} sample a frame. f: dt = {shots.TIME_STEP:g} s, {shots.SWEEPS} sweeps, hinges {shots.HINGE:.3g} k.",
+            f"Adam: rate {adam.RATE:g} k, {adam.STEPS} steps a frame. Patches: {unscented.PATCHES}.",
+            "Printed: one run each, b* = 0.1 and b_thresh = 0.05 without unit, no noise stated.",
+        )
     )
