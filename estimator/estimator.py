@@ -6,7 +6,6 @@ goes perception -> grip -> filter. Sees nothing but observations, the camera's c
 
 import time
 from dataclasses import dataclass
-from functools import cache
 from typing import Literal, get_args
 
 import jax
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.filters.adam import AdamShooting
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
 from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
@@ -25,7 +25,6 @@ from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.perception import Disparity, PointTracker, StereoTracker, TissueMask, Track
 from jiggle_mj.estimator.perception.mesh_field import MeshField
 from jiggle_mj.estimator.surrogate import Membrane, surrogate
-from threadpoolctl import ThreadpoolController
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
@@ -155,7 +154,7 @@ class Estimator:
             PerceptionError: the sheet cannot be found in the first frames, or the first grasp is off the tissue. Once
                 there is an estimate, a frame that cannot be used goes to `skipped` instead.
         """
-        with jax.enable_x64(True), _blas().limit(limits=1, user_api="blas"):
+        with jax.enable_x64(True), one_thread():
             try:
                 found = self._update(observation)
             except PerceptionError as failure:
@@ -324,9 +323,3 @@ class Estimator:
         if tool.held_tracks:
             return np.isin(self._points.ids, tool.held_tracks)
         return None if self.declaration.mesh is None else self.declaration.mesh.held
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    """BLAS's own threads get in the way of XLA's: on two cores, an update with both takes half as long again."""
-    return ThreadpoolController()

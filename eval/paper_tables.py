@@ -204,8 +204,8 @@ def settings_in_words(table: PaperTable, seeds: list[str]) -> str:
             f"xpbd, equilibrium: the scene's mesh, b* = {STIFFNESS:g} k,",
             f"lifts of {HEIGHT:g} of the width in {INCREMENTS} moves, each from rest. mujoco: the scene as shipped.",
             f"Attached: above {RULE:g} b*. Prior sd {common.prior_sd:.3g} k, force sd {common.force_sd:g} k x spacing,",
-            f"{common.samples} sample a frame. f: dt = {shots.TIME_STEP:g} s, {shots.SWEEPS} sweeps, hinges {shots.HINGE:.3g} k.",
-            f"Adam: rate {adam.RATE:g} k, {adam.STEPS} steps a frame. Patches: {unscented.PATCHES}.",
-            "Printed: one run each, b* = 0.1 and b_thresh = 0.05 without unit, no noise stated.",
+            f"{common.samples} sample a frame. f: dt = {shots.TIME_STEP:g} s, {shots.SWEEPS} sweeps,",
+            f"hinges {shots.HINGE:.3g} k. Adam: rate {adam.RATE:g} k, {adam.STEPS} steps a frame.",
+            f"Patches: {unscented.PATCHES}. Printed: one run each, b* = 0.1 and b_thresh = 0.05 without unit, no noise stated.",
         )
     )

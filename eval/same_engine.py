@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from jiggle_mj.estimator import EstimatorConfig
+from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
@@ -118,7 +119,7 @@ def _moments(scene: Scene, engine: Engine, grasps: int, stiffness: float) -> tup
     declaration = replace(scene.declared.declaration(), mesh=named)
     if engine == "xpbd":
         declaration = replace(declaration, gravity=(0.0, 0.0, 0.0), bed=False)
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), one_thread():
         b = jnp.asarray(stiffness * declaration.membrane_stiffness * attached)
         step = (_xpbd if engine == "xpbd" else _equilibrium)(mesh, declaration, b)
         return declaration, tuple(_carried_out(_actions(scene, grasps), mesh, declaration, step))
