@@ -206,6 +206,6 @@ def settings_in_words(table: PaperTable, seeds: list[str]) -> str:
             f"Attached: above {RULE:g} b*. Prior sd {common.prior_sd:.3g} k, force sd {common.force_sd:g} k x spacing,",
             f"{common.samples} sample a frame. f: dt = {shots.TIME_STEP:g} s, {shots.SWEEPS} sweeps,",
             f"hinges {shots.HINGE:.3g} k. Adam: rate {adam.RATE:g} k, {adam.STEPS} steps a frame.",
-            f"Patches: {unscented.PATCHES}. Printed: one run each, b* = 0.1, b_thresh = 0.05, no units, noise not stated.",
+            f"{unscented.PATCHES} patches. Printed: one run each, b* = 0.1, b_thresh = 0.05, no units, no noise.",
         )
     )
