@@ -142,7 +142,7 @@ def _payload(
         "axes": list(plane.names),
         "flat": _fixed(flat, 2),
         "top_b": top,
-        "top_sd": max(float(estimate.sd.max()) for estimate in estimates),
+        "top_sd": max(float(np.nan_to_num(estimate.sd).max()) for estimate in estimates),
         "grids": grids,
         "detected": detection.attached.astype(int).tolist(),
         "score": _significant(detection.score),
