@@ -199,6 +199,16 @@ def test_the_page_asks_nothing_of_the_network_and_stays_small(tmp_path):
     assert path.stat().st_size < LIMIT_BYTES
 
 
+def test_an_estimator_without_uncertainty_has_a_page(tmp_path):
+    """NaN is 'not stated', in estimates and belief; the page's data are JSON, which has none."""
+    run = synthetic()
+    none = np.full(len(run["sheet"].rest), np.nan)
+    bare = [replace(estimate, sd=none, entropy=float("nan"), nis=float("nan")) for estimate in run["estimates"]]
+    belief = Belief(mean=none, covariance=np.diag(none))
+    page = write(tmp_path / "report.html", truth=True, images=False, estimates=bare, belief=belief)
+    assert "no stated deviation" in page
+
+
 def test_the_same_run_gives_the_same_bytes(tmp_path):
     assert write(tmp_path / "a.html", truth=True, images=True) == write(tmp_path / "b.html", truth=True, images=True)
 
