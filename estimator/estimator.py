@@ -12,12 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.filters.adam import AdamShooting
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
 from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
 from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
 from jiggle_mj.estimator.filters.unscented import ReducedUnscented
 from jiggle_mj.estimator.grip import GripHold
@@ -48,20 +50,24 @@ class EstimatorConfig:
     """Frames that each update of the explicit filter or of adam simulates, the latest among them."""
     membrane: Membrane = "triangles"
     """Law of the sheet's plane where no step is simulated: St Venant-Kirchhoff triangles, or springs along edges."""
+    reference: float = 1.0
+    """Attachment stiffness in the middle of the implicit filter's scale from free to rigid [k]."""
     prior_sd: float = 1 / 75
-    """Standard deviation of each attachment stiffness before anything is seen [k]."""
+    """Standard deviation of each attachment stiffness before anything is seen, for the other filters [k]."""
     force_sd: float = 4.5e-3
     """Standard deviation of the force that the model gets wrong on a particle [k x spacing]."""
+    anchor_sd: float = 1e-4
+    """How far a welded particle may be from its anchor, for the implicit filter [m]."""
     grip_sd: float = 1.5e-3
     """How well held particles follow the tip [m]."""
     grip_stiffness: float = 3.0
     """Of the springs that carry held particles with the tip while the state is searched [k]."""
     detect_above: float = 0.011
-    """A particle is reported attached when its mean stiffness exceeds this [k]."""
+    """Filters that state no probability report a particle attached when its mean stiffness exceeds this [k]."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("spacing", "prior_sd", "force_sd", "grip_sd", "grip_stiffness", "detect_above"):
+        for name in POSITIVE:
             if not getattr(self, name) > 0:
                 raise ValueError(f"EstimatorConfig.{name} must be above 0; got {getattr(self, name)}.")
         if self.filter not in get_args(FilterName):
@@ -70,6 +76,21 @@ class EstimatorConfig:
             raise ValueError(f"EstimatorConfig.samples must be an integer of at least 1; got {self.samples}.")
         if self.membrane not in ("triangles", "edges"):
             raise ValueError(f"EstimatorConfig.membrane must be 'triangles' or 'edges'; got {self.membrane!r}.")
+
+
+RULE = "P(attached) > 0.5"
+"""Of filters that state a probability."""
+POSITIVE = (
+    "spacing",
+    "reference",
+    "prior_sd",
+    "force_sd",
+    "anchor_sd",
+    "grip_sd",
+    "grip_stiffness",
+    "detect_above",
+)
+"""Settings that must be above 0."""
 
 
 class Estimator:
@@ -122,28 +143,46 @@ class Estimator:
 
     @property
     def belief(self) -> Belief:
-        """The Gaussian belief so far.
+        """The belief so far; `release` first, once a grasp is over.
 
         Raises:
             ValueError: asked before the first frame with closed jaws.
         """
         self._check_begun()
-        with jax.enable_x64(True):
+        with jax.enable_x64(True), one_thread():
             mean, covariance = self._belief.moments()
-            return Belief(mean=np.asarray(mean), covariance=np.asarray(covariance))
+            if isinstance(self._belief, BoundaryBelief):
+                return Belief(mean=np.asarray(mean), covariance=np.asarray(covariance))
+            lower, upper = self._belief.interval()
+            return Belief(
+                mean=np.asarray(mean),
+                covariance=np.asarray(covariance),
+                reference=float(self._belief.reference),
+                lower=np.asarray(lower),
+                upper=np.asarray(upper),
+            )
 
     @property
     def detection(self) -> Detection:
-        """Which particles are called attached so far.
+        """Which particles are called attached so far; see `belief`.
 
         Raises:
             ValueError: asked before the first frame with closed jaws.
         """
         self._check_begun()
+        if np.isfinite(self._probability).all():
+            return Detection(
+                attached=self._probability > 0.5,
+                score=self._probability,
+                stiffness=self._b,
+                probabilistic=True,
+                rule=RULE,
+            )
         limit = self.config.detect_above * self.declaration.membrane_stiffness
         return Detection(
             attached=self._b > limit,
             score=self._b,
+            stiffness=self._b,
             rule=f"non-negative mean of b > {self.config.detect_above:g} k = {limit:.3g} N/m",
         )
 
@@ -165,6 +204,16 @@ class Estimator:
         self._used |= found is not None
         return found
 
+    def release(self) -> None:
+        """Say that the grasp is over: its frames are judged again in the light of all of them.
+
+        Happens by itself when the jaws open or a new grasp begins; needed only where observations end with closed jaws.
+        """
+        if isinstance(self._filter, ImplicitFilter) and isinstance(self._belief, AttachmentBelief):
+            with jax.enable_x64(True), one_thread():
+                self._belief, posterior = self._filter.release(self._belief)
+                self._b, self._probability = np.asarray(posterior.stiffness), np.asarray(posterior.attached)
+
     def _update(self, observation: Observation) -> Estimate | None:
         tool = observation.tool
         if self._filter is None:
@@ -173,9 +222,13 @@ class Estimator:
                 return None
             self._filter = self._begin()
         if not tool.closed:
+            if self._hold is not None:
+                self.release()
             self._hold = self._closing = None
             return None
         if self._closing is None or self._closing.grasp != tool.grasp:
+            if self._hold is not None:
+                self.release()
             self._closing = tool
         began = time.perf_counter()
         track = self._see(observation)
@@ -192,6 +245,7 @@ class Estimator:
             )
         self._hold, self._belief = hold, update.belief
         self._x, self._b = np.asarray(update.x), np.asarray(update.b)
+        self._probability = np.asarray(update.probability)
         return Estimate(
             index=observation.index,
             time=observation.time,
@@ -199,6 +253,7 @@ class Estimator:
             observed=track.positions,
             mean=self._b,
             sd=np.asarray(update.sd),
+            probability=self._probability,
             held=hold.held,
             entropy=float(update.entropy),
             nis=float(update.nis),
@@ -240,11 +295,16 @@ class Estimator:
             self._sheet = self._points.start(self._still)
         mesh, k = SheetMesh(self._sheet.rest, self._sheet.faces), self.declaration.membrane_stiffness
         self._field = MeshField(SheetPlane.through(mesh.rest).flatten(mesh.rest), mesh.faces)
+        found = self._build(mesh)
         prior_mean = PRIOR_MEAN if self.config.filter == "explicit" else 0.0
-        self._belief = BoundaryBelief.prior(mesh.n, mean=prior_mean, sd=self.config.prior_sd * k)
+        self._belief: BoundaryBelief | AttachmentBelief = (
+            found.prior
+            if isinstance(found, ImplicitFilter)
+            else BoundaryBelief.prior(mesh.n, mean=prior_mean, sd=self.config.prior_sd * k)
+        )
         self.prior_entropy = float(self._belief.entropy())
-        self._x, self._b = mesh.rest, np.zeros(mesh.n)
-        return self._build(mesh)
+        self._x, self._b, self._probability = mesh.rest, np.zeros(mesh.n), np.full(mesh.n, np.nan)
+        return found
 
     def _build(self, mesh: SheetMesh) -> Filter:
         """The filter that the settings name."""
@@ -258,7 +318,16 @@ class Estimator:
             return NonNegativeLeastSquares.build(energy, force_sd=force_sd)
         if config.filter == "unscented":
             return ReducedUnscented(mesh, energy, grip_stiffness=grip_stiffness, force_tolerance=force_sd / 4)
-        return ImplicitFilter.build(mesh, energy, force_sd=force_sd, grip_stiffness=grip_stiffness)
+        reference = config.reference * k
+        balance = ForceBalance.build(
+            mesh,
+            energy,
+            reference=reference,
+            force_sd=force_sd,
+            anchor_sd=config.anchor_sd,
+            grip_stiffness=grip_stiffness,
+        )
+        return ImplicitFilter(balance, prior_belief(mesh, reference=reference))
 
     def _see(self, observation: Observation) -> Track:
         if observation.images is not None and self._stereo is not None:

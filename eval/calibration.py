@@ -41,10 +41,11 @@ def nees_per_dof(belief: Belief, stiffness: Float[np.ndarray, " n"]) -> float | 
     Raises:
         ValueError: the covariance is not positive definite.
     """
-    known = np.isfinite(stiffness) & np.isfinite(np.diagonal(belief.covariance))
+    truth = belief.coordinate(stiffness)
+    known = np.isfinite(truth) & np.isfinite(np.diagonal(belief.covariance))
     if not known.any():
         return None
-    error = belief.mean[known].astype(np.float64) - stiffness[known]
+    error = belief.mean[known].astype(np.float64) - truth[known]
     covariance = belief.covariance[np.ix_(known, known)].astype(np.float64)
     try:
         factor = cho_factor(covariance, lower=True)
@@ -61,6 +62,9 @@ def coverage(belief: Belief, stiffness: Float[np.ndarray, " n"], level: float = 
     known = np.isfinite(stiffness) & np.isfinite(np.diagonal(belief.covariance))
     if not known.any():
         return None
+    if belief.lower is not None and belief.upper is not None:
+        known = ~np.isnan(stiffness)
+        return float(np.mean((belief.lower <= stiffness)[known] & (stiffness <= belief.upper)[known]))
     half_width = ndtri((1 + level) / 2) * np.sqrt(np.diagonal(belief.covariance)[known])
     return float(np.mean(np.abs(belief.mean[known] - stiffness[known]) <= half_width))
 

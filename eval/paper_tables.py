@@ -1,8 +1,9 @@
 """The paper's two tables of simulated estimation, printed figures beside measured ones.
 
 Table 1 (`simulation`): four corner grasps. Appendix (`one-lift`): the first of them. Five shapes, each method against
-three references: the two engines of `same_engine`, and MuJoCo's vertices with noise, by `run_scene`. All methods share
-the prior and the paper's rule, attached above half of b*. Each run has a folder, and is not repeated.
+three references: the two engines of `same_engine`, and MuJoCo's vertices with noise, by `run_scene`. The Gaussian
+methods share the prior and the paper's rule, attached above half of b*; ours states P(attached), and knows no b*. Each
+run has a folder, and is not repeated.
 """
 
 from collections.abc import Callable, Iterable

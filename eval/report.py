@@ -33,6 +33,8 @@ MAX_STEPS = 60
 """Frames on the slider."""
 MAX_PARTICLE_STEPS = 120_000
 """Particles times frames on the slider, for each of estimate and truth: about 4 MB of numbers."""
+MOST_DRAWN = 9.0
+"""Stiffnesses above are drawn like it [reference of the belief]."""
 UNDEFINED = "\N{EN DASH}"
 
 
@@ -75,7 +77,7 @@ def write_report(
     carried = None if truth is None else carry(sheet, truth, estimates[-1].index)
     kept = shown_steps(estimates, sheet.rest)
     pairs = [] if images is None or camera is None else pictures(estimates, images, camera, kept)
-    payload = _payload(sheet, estimates, detection, truth, carried)
+    payload = _payload(sheet, estimates, belief, detection, truth, carried)
     payload["opening"] = _opening(estimates, kept, sheet.rest)
     payload["pictures"] = [
         {
@@ -93,10 +95,10 @@ def write_report(
     page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     page.filters.update(number=_text, percent=_percent, milli=_milli)
     beside = None
-    sentences = [found(sheet, detection, estimates[-1], plane_of(sheet.rest))]
+    sentences = [found(sheet, detection, plane_of(sheet.rest))]
     if truth is not None and carried is not None:
         beside = _beside(sheet, estimates, belief, detection, truth, carried)
-        sentences += [against_truth(sheet, detection, carried), stiffness_sums(sheet, belief, estimates[-1], carried)]
+        sentences += [against_truth(sheet, detection, carried), stiffness_sums(sheet, belief, detection, carried)]
     text = page.from_string((here / "report.html").read_text("utf-8")).render(
         result=result,
         sentences=sentences,
@@ -104,6 +106,7 @@ def write_report(
         ring_mm=spacing(sheet.rest, sheet.faces) * 1e3,
         gate_variance=GATE_VARIANCE,
         has_pictures=bool(pairs),
+        has_probability=detection.probabilistic,
         n_steps=len(kept),
         opening=payload["opening"],
         settings=list(_rows(settings)),
@@ -121,6 +124,7 @@ def write_report(
 def _payload(
     sheet: Sheet,
     estimates: Sequence[Estimate],
+    belief: Belief,
     detection: Detection,
     truth: Truth | None,
     carried: CarriedTruth | None,
@@ -128,11 +132,14 @@ def _payload(
     plane, last = plane_of(sheet.rest), estimates[-1]
     flat = plane.flatten(sheet.rest) * 1e3
     true_b = None if truth is None else stiffness_at(truth, frame_at(truth, last.index))
+    most = math.inf if belief.reference is None else MOST_DRAWN * belief.reference
     finite = [] if carried is None else carried.stiffness[np.isfinite(carried.stiffness)].tolist()
-    top = max([float(last.mean.max()), *finite]) or 1.0
+    top = max([min(float(detection.stiffness.max()), most), *finite]) or 1.0
     x, y, corners, weights = grid_of(flat, sheet.faces)
     grids = {"x": _fixed(x, 2), "y": _fixed(y, 2)}
-    fields = {"mean": last.mean, "sd": last.sd}
+    fields = {"mean": detection.stiffness, "sd": last.sd}
+    if detection.probabilistic:
+        fields["probability"] = detection.score
     if carried is not None:
         fields["truth"] = np.where(np.isfinite(carried.stiffness), carried.stiffness, top)
     for name, values in fields.items():
@@ -146,7 +153,7 @@ def _payload(
         "grids": grids,
         "detected": detection.attached.astype(int).tolist(),
         "score": _significant(detection.score),
-        "mean": _significant(last.mean),
+        "mean": _significant(detection.stiffness),
         "sd": _significant(last.sd),
         "faces": sheet.faces.T.tolist(),
         "series": _series(sheet, estimates, truth),
@@ -216,7 +223,7 @@ def _beside(
     carried: CarriedTruth,
 ) -> dict[str, object]:
     """Figures that `result.json` has no key for."""
-    certain = np.diagonal(belief.covariance) <= GATE_VARIANCE
+    certain = estimates[-1].sd ** 2 <= GATE_VARIANCE
     true_b = stiffness_at(truth, frame_at(truth, estimates[-1].index))
     places, held_at = sheet.rest[detection.attached], truth.rest[~(true_b == 0)]
     return {

@@ -139,7 +139,7 @@ def _actions(scene: Scene, grasps: int) -> Iterator[Action]:
 
 
 def _carried_out(actions: Iterator[Action], mesh: SheetMesh, declaration: Declaration, step) -> Iterator[_Moment]:
-    x, stiff = mesh.rest, EstimatorConfig().grip_stiffness * declaration.membrane_stiffness
+    grip, x, stiff = None, mesh.rest, EstimatorConfig().grip_stiffness * declaration.membrane_stiffness
     tool = ToolState(position=AWAY, quat_wxyz=np.eye(4)[0], closed=False, grasp=0, radius=1e-9)
     for action in actions:
         if isinstance(action, Grasp):
@@ -149,7 +149,7 @@ def _carried_out(actions: Iterator[Action], mesh: SheetMesh, declaration: Declar
             tool = replace(
                 tool, position=action.point, closed=True, grasp=tool.grasp + 1, radius=action.radius, held_tracks=held
             )
-        elif isinstance(action, Move):
+        elif isinstance(action, Move) and grip is not None:
             tool = replace(tool, position=action.to)
             x = step(x, eqx.tree_at(lambda g: g.tip, grip, jnp.asarray(action.to)))
         yield _Moment(x=x, tool=tool)

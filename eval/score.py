@@ -113,7 +113,8 @@ def with_truth(
     """A copy of `unscored` with all that the truth decides; the truth is that at the last frame the estimator used."""
     carried = carry(sheet, truth, estimates[-1].index if estimates else 0)
     agreements = {rings: agreement(detection.attached, carried.attached, sheet.faces, rings) for rings in DILATIONS}
-    judged = calibration(belief, carried.stiffness, carried.attached)
+    probability = detection.score if detection.probabilistic else None
+    judged = calibration(belief, carried.stiffness, carried.attached, probability=probability)
     scored = copy.deepcopy(unscored)
     _section(scored, "detection").update(
         n_detected=int(detection.attached.sum()),

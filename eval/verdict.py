@@ -5,13 +5,13 @@ from jiggle_mj.eval.carrying import CarriedTruth
 from jiggle_mj.eval.flat_map import Plane
 from jiggle_mj.eval.metrics import dilate, patches
 
-from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.estimate import Belief, Detection, Sheet
 
 NAMED_PATCHES = 3
 """Patches whose place is spelled out; the others are counted."""
 
 
-def found(sheet: Sheet, detection: Detection, last: Estimate, plane: Plane) -> str:
+def found(sheet: Sheet, detection: Detection, plane: Plane) -> str:
     """How many particles are reported attached, in which patches, where, and how stiff."""
     groups = patches(detection.attached, sheet.faces)
     total = int(detection.attached.sum())
@@ -26,7 +26,7 @@ def found(sheet: Sheet, detection: Detection, last: Estimate, plane: Plane) -> s
     listed = "; ".join(places) + (f"; and {rest} smaller {'one' if rest == 1 else 'ones'}" if rest > 0 else "")
     verb = "particle is" if total == 1 else "particles are"
     counted = "in one patch" if len(groups) == 1 else f"in {len(groups)} patches"
-    stiffness = float(np.mean(last.mean[detection.attached]))
+    stiffness = float(np.mean(detection.stiffness[detection.attached]))
     return f"{total} {verb} reported attached, {counted} ({listed}), at {stiffness:.2g} N/m each on average."
 
 
@@ -47,17 +47,15 @@ def against_truth(sheet: Sheet, detection: Detection, carried: CarriedTruth) -> 
     return text + "."
 
 
-def stiffness_sums(sheet: Sheet, belief: Belief, last: Estimate, carried: CarriedTruth) -> str:
+def stiffness_sums(sheet: Sheet, belief: Belief, detection: Detection, carried: CarriedTruth) -> str:
     """Over the attached particles and one ring around them: the estimated sum of b, its deviation, and the true one."""
     if not carried.attached.any() or not np.isfinite(carried.stiffness).all():
         return ""
     near = dilate(carried.attached, sheet.faces, 1)
-    sd = float(np.sqrt(belief.covariance[np.ix_(near, near)].sum()))
+    sd = belief.deviation_of_sum(detection.stiffness, near)
     stated = f"a stated standard deviation of {sd:.1f}" if np.isfinite(sd) else "no stated deviation"
-    return (
-        f"Over these and one ring around them b sums to {last.mean[near].sum():.1f} N/m, with {stated}; the truth is "
-        f"{carried.stiffness[near].sum():.1f}."
-    )
+    total, true = detection.stiffness[near].sum(), carried.stiffness[near].sum()
+    return f"Over these and one ring around them b sums to {total:.1f} N/m, with {stated}; the truth is {true:.1f}."
 
 
 def _integer(value: float) -> str:

@@ -215,6 +215,31 @@ def table(
         print(paper_tables.markdown(table, paper_tables.measure(table, cells, seeds or range(10), out, say=say)))
 
 
+def bench(*, sizes: tuple[int, ...] = (600, 1200), gate: bool = False, as_json: AsJson = False) -> None:
+    """Time the estimator's parts on this machine, compile time apart; medians.
+
+    Args:
+        sizes: about how many particles; the first is compared with the paper's filter too.
+        gate: fail where something became worse than the committed baseline allows.
+        as_json: print the figures to stdout.
+    """
+    from jiggle_mj.eval.benchmark import baseline, benchmark, regressions
+
+    metrics = benchmark(sizes, explicit=True, say=lambda text: console.print(text, highlight=False))
+    table = Table("", "figure", "", box=None)
+    for name, entry in metrics.items():
+        value = entry["value"]
+        table.add_row(name, value if isinstance(value, str) else f"{value:.3g}", str(entry["unit"]))
+    console.print(table)
+    if as_json:
+        print(json.dumps(metrics))
+    worse = regressions(metrics, baseline()) if gate else []
+    for line in worse:
+        console.print(line, style="red", highlight=False)
+    if worse:
+        sys.exit(1)
+
+
 def doctor(*, as_json: AsJson = False) -> None:
     """Check this machine: versions, JAX devices, offscreen OpenGL, cores and memory.
 
@@ -241,6 +266,7 @@ VERBS = {
     "estimate": estimate,
     "score": score,
     "table": table,
+    "bench": bench,
     "doctor": doctor,
 }
 

@@ -193,6 +193,7 @@ def estimate(
             n_frames += 1
             if on_frame is not None:
                 on_frame(observation, one)
+        estimator.release()
         unread = observations.skipped if isinstance(observations, Recording) else []
         skipped = tuple(sorted((*unread, *estimator.skipped)))
         if not estimates:

@@ -30,7 +30,9 @@ class Estimate:
     mean: Float[np.ndarray, " n"]
     """Mean attachment stiffness, constrained to be non-negative [N/m]."""
     sd: Float[np.ndarray, " n"]
-    """Its standard deviation [N/m]."""
+    """Its standard deviation [N/m]; NaN from an estimator that states none."""
+    probability: Float[np.ndarray, " n"]
+    """P(attached); NaN from an estimator that states none."""
     held: Bool[np.ndarray, " n"]
     """Which particles are in the grip."""
     entropy: float
@@ -47,12 +49,31 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Belief:
-    """Gaussian over the attachment stiffnesses, before the non-negativity constraint."""
+    """Gaussian over all attachments: over their stiffness b [N/m], or bounded, over s = b / (b + reference)."""
 
     mean: Float[np.ndarray, " n"]
-    """[N/m]."""
+    """Of b, before the constraint b >= 0 [N/m], or of s."""
     covariance: Float[np.ndarray, "n n"]
-    """[N^2/m^2]."""
+    """Of b [N^2/m^2], or of s."""
+    reference: float | None = None
+    """The stiffness that s = 1/2 stands for [N/m]; None where the Gaussian is over b."""
+    lower: Float[np.ndarray, " n"] | None = None
+    """Lower end of each particle's own 90 % interval of b [N/m]: 0 where being free cannot be excluded. None where not
+    stated, as for a Gaussian over b."""
+    upper: Float[np.ndarray, " n"] | None = None
+    """Its upper end [N/m]; infinite where only a lower end is known."""
+
+    def coordinate(self, b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Stiffnesses [N/m] in the Gaussian's own variable; infinity is a weld."""
+        if self.reference is None:
+            return b
+        finite = np.where(np.isinf(b), 0.0, b)
+        return np.where(np.isinf(b), 1.0, finite / (finite + self.reference))
+
+    def deviation_of_sum(self, b: Float[np.ndarray, " n"], chosen: Bool[np.ndarray, " n"]) -> float:
+        """Standard deviation of the sum of b over the chosen particles [N/m], around the estimate b."""
+        slope = np.ones_like(b) if self.reference is None else (b + self.reference) ** 2 / self.reference
+        return float(np.sqrt(slope[chosen] @ self.covariance[np.ix_(chosen, chosen)] @ slope[chosen]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +82,9 @@ class Detection:
 
     attached: Bool[np.ndarray, " n"]
     score: Float[np.ndarray, " n"]
-    """Ranks the particles, for the average precision."""
+    """Ranks the particles, for the average precision; a probability of being attached where `probabilistic`."""
+    stiffness: Float[np.ndarray, " n"]
+    """The estimate of b that belongs to it [N/m]."""
+    probabilistic: bool = False
     rule: str
     """In words, with its numbers; never depends on the scene's true stiffness."""

@@ -8,10 +8,10 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -90,6 +90,7 @@ class EstimateWriter:
         for prefix, positions in (("observed", estimate.observed), ("rest", self._sheet.rest)):
             columns |= {f"{prefix}_{axis}": np.asarray(positions, float)[:, i] for i, axis in enumerate("xyz")}
         columns |= {"b_mean": np.asarray(estimate.mean, float), "b_sd": np.asarray(estimate.sd, float)}
+        columns["p_attached"] = np.asarray(estimate.probability, float)
         output.message(POINTS, time, point_cloud(time, columns | {"held": np.asarray(estimate.held, bool)}))
         output.message(MESH, time, _mesh_message(estimate, self._sheet))
         numbers = {name: _json_number(getattr(estimate, name)) for name in ("entropy", "nis", "boundary_energy")}
@@ -110,8 +111,9 @@ class EstimateWriter:
             skipped: index and reason of each observation that was not used.
         """
         output = self._output
-        output.arrays(BELIEF, {"mean": np.asarray(belief.mean), "covariance": np.asarray(belief.covariance)})
-        output.arrays(DETECTION, {"attached": np.asarray(detection.attached), "score": np.asarray(detection.score)})
+        for name, said, left_out in ((BELIEF, belief, ()), (DETECTION, detection, ("rule",))):
+            stated = {field.name: getattr(said, field.name) for field in fields(said) if field.name not in left_out}
+            output.arrays(name, {key: np.asarray(value) for key, value in stated.items() if value is not None})
         listed = json.dumps([[int(index), why] for index, why in skipped])
         output.metadata(RESULT, {"rule": detection.rule, "skipped": listed})
         self.close()
@@ -163,8 +165,8 @@ def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False
     return EstimateRecording(
         sheet=Sheet(**arrays[SHEET]),
         estimates=tuple(_parse(*pair) for pair in zip(messages[POINTS], messages[DIAGNOSTICS], strict=False)),
-        belief=Belief(**arrays[BELIEF]) if result else None,
-        detection=Detection(**arrays[DETECTION], rule=result["rule"]) if result else None,
+        belief=Belief(**_scalars(arrays[BELIEF])) if result else None,
+        detection=Detection(**_scalars(arrays[DETECTION]), rule=result["rule"]) if result else None,
         skipped=tuple((index, why) for index, why in json.loads(result["skipped"])) if result else (),
         metadata=metadata.get(METADATA, {}),
     )
@@ -183,11 +185,17 @@ def _parse(points: Message, diagnostics: Message) -> Estimate:
         observed=np.column_stack([columns[f"observed_{axis}"] for axis in "xyz"]),
         mean=columns["b_mean"],
         sd=columns["b_sd"],
+        probability=columns["p_attached"],
         held=columns["held"].astype(bool),
         update_s=0.0,
         perception_s=0.0,
         **numbers,
     )
+
+
+def _scalars(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Arrays of no dimension as the numbers that they were."""
+    return {name: value if value.ndim else value.item() for name, value in arrays.items()}
 
 
 def _json_number(value: float) -> float | None:

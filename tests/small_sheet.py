@@ -6,10 +6,14 @@ from functools import cache
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.block_tridiagonal import BlockTridiagonal, Layout
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.filters.implicit import prior_belief
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.surrogate import surrogate
 
@@ -22,6 +26,11 @@ STIFFNESS = 3.0
 GRIP_RADIUS = 8e-3
 FORCE_TOLERANCE = 1e-8
 """[N]; the weight of one particle is 4e-4."""
+
+WELD = 1e6
+"""[N/m]."""
+NOISE, GRIP_SD = 1e-4, 1.5e-3
+"""Standard deviations of what is seen of a particle, and of a held one [m]."""
 
 search = eqx.filter_jit(equilibrium)
 
@@ -79,6 +88,21 @@ def sheet_energy() -> SheetEnergy:
     return surrogate(sheet(), DECLARATION)
 
 
+@cache
+def sheet_balance(force_sd: float) -> ForceBalance:
+    """What the implicit filter linearises; force_sd [N]."""
+    k = DECLARATION.membrane_stiffness
+    return ForceBalance.build(
+        sheet(), sheet_energy(), reference=k, force_sd=force_sd, anchor_sd=1e-4, grip_stiffness=3 * k
+    )
+
+
+@cache
+def sheet_prior() -> AttachmentBelief:
+    """The implicit filter's."""
+    return prior_belief(sheet(), reference=DECLARATION.membrane_stiffness)
+
+
 def gripped(energy: SheetEnergy, x: np.ndarray, corner: np.ndarray, tip: np.ndarray) -> SheetEnergy:
     """The energy with jaws that closed at a corner around particles at x, the tip moved since."""
     grip = Grip.build(jnp.asarray(x), jnp.asarray(corner), radius=GRIP_RADIUS, stiffness=100.0)
@@ -99,8 +123,11 @@ def corners() -> list[np.ndarray]:
 
 @cache
 def lifts(stiffness: float = STIFFNESS) -> tuple[Lift, ...]:
-    """Three frames of each of four corner lifts, the attached particles on springs of the given stiffness."""
-    energy, b = sheet_energy(), jnp.asarray(stiffness * attached())
+    """Three frames of each of four corner lifts, the attached particles on springs of the given stiffness.
+
+    Infinity is a weld: a spring so stiff that nothing moves by a micrometre.
+    """
+    energy, b = sheet_energy(), jnp.asarray(min(stiffness, WELD) * attached())
     frames = []
     for grasp, corner in enumerate(corners(), start=1):
         x = sheet().rest
@@ -112,3 +139,14 @@ def lifts(stiffness: float = STIFFNESS) -> tuple[Lift, ...]:
             x = np.asarray(found.x)
             frames.append(Lift(x=x, tip=tip, held=held, grasp=grasp))
     return tuple(frames)
+
+
+def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:
+    """Noisy positions, and held particles as the tip says."""
+    noisy = frame.x + NOISE * np.random.default_rng(seed).normal(size=frame.x.shape)
+    sd = np.where(frame.held, GRIP_SD, NOISE)
+    precision = np.eye(3) / sd[:, None, None] ** 2
+    if unseen is not None:
+        precision = np.where(unseen[:, None, None], 0.0, precision)
+    held = jnp.asarray(frame.held)
+    return Evidence(y=jnp.asarray(noisy), precision=jnp.asarray(precision), held=held, loaded=held)

@@ -30,6 +30,7 @@ def estimate(index: int, **changes) -> Estimate:
         "observed": observed,
         "mean": generator.uniform(0, 2, N),
         "sd": generator.uniform(0, 2, N),
+        "probability": generator.uniform(0, 1, N),
         "held": generator.uniform(size=N) > 0.5,
         "entropy": -1 / 3,
         "nis": np.nan,
@@ -42,12 +43,18 @@ def estimate(index: int, **changes) -> Estimate:
 
 def belief() -> Belief:
     root = np.random.default_rng(2).normal(size=(N, N))
-    return Belief(mean=np.linspace(-1, 1, N) / 3, covariance=root @ root.T)
+    return Belief(
+        mean=np.linspace(-1, 1, N) / 3,
+        covariance=root @ root.T,
+        reference=30.0,
+        lower=np.zeros(N),
+        upper=np.full(N, np.inf),
+    )
 
 
 def detection() -> Detection:
     score = np.linspace(0, 1, N) / 3
-    return Detection(attached=score > 0.2, score=score, rule="score > 0.2")
+    return Detection(attached=score > 0.2, score=score, stiffness=3 * score, rule="score > 0.2", probabilistic=True)
 
 
 def test_an_estimate_is_read_back_exactly_but_for_wall_times(tmp_path):

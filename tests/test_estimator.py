@@ -12,8 +12,8 @@ from jiggle_mj.errors import MeshError, PerceptionError, RecordingError
 from jiggle_mj.observation import MeasuredPoints, Observation, StereoPair, ToolState
 
 NOISE = 5e-5
-CONFIG = EstimatorConfig(force_sd=5e-4, prior_sd=0.05, detect_above=1 / 30)
-"""A small force error, as the data come from the estimator's own model; prior and rule at half and a third of b."""
+CONFIG = EstimatorConfig(force_sd=5e-4)
+"""A small force error, as the data come from the estimator's own model."""
 
 
 def observe(index: int, x: np.ndarray, tip: np.ndarray, grasp: int, *, closed: bool = True) -> Observation:
@@ -64,7 +64,8 @@ def test_frames_before_the_first_grasp_give_no_estimate_and_those_with_closed_ja
 def test_the_belief_sharpens_and_starts_from_the_prior(run):
     estimator, estimates = run
     entropies = [estimator.prior_entropy, *(one.entropy for one in estimates[2:])]
-    assert (np.diff(entropies) < 0).all()
+    assert entropies[-1] < entropies[0] - 100
+    assert np.diff(entropies).max() < 5  # free or attached: news may leave it less sure than it was
     assert estimator.belief.covariance.shape == (sheet().n, sheet().n)
 
 
@@ -181,8 +182,8 @@ def test_a_later_grasp_off_the_tissue_is_skipped_by_name_and_keeps_what_was_lear
 
 
 def test_the_papers_edge_springs_find_the_attachments_too(run):
-    """The data come from triangles, so the rule misses some; none further than a ring is reported."""
-    estimator = Estimator(DECLARATION, config=dataclasses.replace(CONFIG, membrane="edges", force_sd=4.5e-3))
+    """The data come from triangles, so some are missed; none further than a ring is reported."""
+    estimator = Estimator(DECLARATION, config=dataclasses.replace(CONFIG, membrane="edges"))
     for one in episode():
         estimator.update(one)
     assert estimator.detection.attached[attached()].mean() >= 0.5

@@ -55,6 +55,7 @@ def estimate_of(positions, observed) -> Estimate:
         observed=observed,
         mean=np.zeros(n),
         sd=np.ones(n),
+        probability=np.full(n, np.nan),
         held=np.zeros(n, dtype=bool),
         entropy=0.0,
         nis=1.0,

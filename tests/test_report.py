@@ -94,6 +94,7 @@ def synthetic() -> dict:
                 observed=np.where(seen[:, None], true + rng.normal(0, 3e-4, (n, 3)), np.nan),
                 mean=np.maximum(0, mean * share + rng.normal(0, 0.03, n)),
                 sd=np.full(n, 0.5) * (1 - 0.8 * share * rng.random(n)),
+                probability=np.full(n, np.nan),
                 held=held,
                 entropy=float(400 - 900 * share),
                 nis=float(rng.normal(1.1, 0.1)),
@@ -112,7 +113,8 @@ def synthetic() -> dict:
             )
         )
     sheet = Sheet(rest=rest, faces=faces)
-    detection = Detection(attached=detected, score=estimates[-1].mean, rule="constrained mean above 0.5 N/m")
+    last = estimates[-1].mean
+    detection = Detection(attached=detected, score=last, stiffness=last, rule="constrained mean above 0.5 N/m")
     truth = Truth(
         rest=vertices, faces=triangles, attached=attached, frames=tuple(frames), scene="two lines", details={}
     )
@@ -243,6 +245,7 @@ def estimate_of(positions: np.ndarray, observed: np.ndarray, mean: float) -> Est
         observed=observed,
         mean=np.full(n, mean),
         sd=np.ones(n),
+        probability=np.full(n, np.nan),
         held=np.zeros(n, bool),
     )
 
@@ -251,10 +254,10 @@ def test_the_sentence_counts_patches_and_hits_by_hand():
     """On a strip of ten: reported {0, 1} and {9}, attached {0, 4, 5}: 0 is exact; 4, 5 are more than a ring away."""
     faces = np.array([[k, k + 1, k + 2] for k in range(8)])
     rest = np.column_stack([np.arange(10) * 0.01, np.arange(10) % 2 * 0.01, np.zeros(10)])
-    sheet, last = Sheet(rest=rest, faces=faces), estimate_of(rest, rest, 0.8)
+    sheet = Sheet(rest=rest, faces=faces)
     mask = np.isin(np.arange(10), [0, 1, 9])
-    detection = Detection(attached=mask, score=mask.astype(float), rule="")
-    said = found(sheet, detection, last, plane_of(rest))
+    detection = Detection(attached=mask, score=mask.astype(float), stiffness=np.full(10, 0.8), rule="")
+    said = found(sheet, detection, plane_of(rest))
     assert said.startswith("3 particles are reported attached, in 2 patches (2 around x = 5 mm, y = 5 mm; 1 around x =")
     assert said.endswith("at 0.8 N/m each on average.")
     attached = np.isin(np.arange(10), [0, 4, 5])
@@ -264,10 +267,10 @@ def test_the_sentence_counts_patches_and_hits_by_hand():
     carried = CarriedTruth(attached=mask, stiffness=mask * 1.5)
     belief = Belief(mean=np.full(10, 0.8), covariance=0.01 * np.eye(10) + 0.01)
     # A ring around 0, 1 and 9 is 0-3, 7-9: seven times 0.8; variance 7 * 0.01 + 49 * 0.01; truth 3 * 1.5.
-    summed = stiffness_sums(sheet, belief, last, carried)
+    summed = stiffness_sums(sheet, belief, detection, carried)
     assert "sums to 5.6 N/m, with a stated standard deviation of 0.7; the truth is 4.5." in summed
     welded = replace(carried, stiffness=np.where(mask, np.inf, 0.0))
-    assert stiffness_sums(sheet, belief, last, welded) == ""
+    assert stiffness_sums(sheet, belief, detection, welded) == ""
     nothing = CarriedTruth(attached=np.zeros(10, bool), stiffness=np.zeros(10))
     assert against_truth(sheet, detection, nothing) == "In truth nothing is attached. All 3 reports are false."
 

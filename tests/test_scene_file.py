@@ -1,6 +1,7 @@
 """Scene files: what is read, what is refused, and what the refusal says."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,21 @@ def attached_vertices(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return sheet.vertices, vertex_stiffness(scene.attachments, sheet.vertices) > 0
 
 
-def test_the_shipped_scenes_are_the_seven_promised():
-    assert set(shipped_scenes()) == {*PAPER_COUNTS, "large_attach", "free"}
+STIFFNESSES = {"arc_soft": 0.003, "arc": 1 / 30, "arc_stiff": 1.0, "arc_weld": np.inf}
+"""Of an attached vertex, as a share of the membrane stiffness."""
+
+
+def test_the_shipped_scenes_are_the_ten_promised():
+    assert set(shipped_scenes()) == {*PAPER_COUNTS, *STIFFNESSES, "large_attach", "free"}
+
+
+@pytest.mark.parametrize("name", sorted(STIFFNESSES))
+def test_the_arcs_differ_in_stiffness_alone(name):
+    scene, arc = load_scene(name), load_scene("arc")
+    share = scene.attachments[0].stiffness / scene.declared.membrane_stiffness
+    assert share == pytest.approx(STIFFNESSES[name])
+    same = replace(scene.attachments[0], stiffness=arc.attachments[0].stiffness)
+    assert replace(scene, name=arc.name, attachments=(same,)) == arc
 
 
 @pytest.mark.parametrize("name", sorted(PAPER_COUNTS))
@@ -143,7 +157,7 @@ def test_a_scene_built_in_python_is_checked_like_a_file():
 
 
 def test_an_unknown_name_lists_the_shipped_scenes():
-    with pytest.raises(SceneError, match=r"no scene named 'ark'.*arc, arc_line, free"):
+    with pytest.raises(SceneError, match=r"no scene named 'ark'.*arc, arc_line, arc_soft"):
         load_scene("ark")
 
 

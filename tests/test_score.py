@@ -20,7 +20,10 @@ FACES = np.array([[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]])
 STIFFNESS = np.array([0.8, 0.8, 0, 0, 0, 0])
 SHEET = Sheet(rest=REST, faces=FACES)
 DETECTION = Detection(
-    attached=np.array([True, False, False, False, False, True]), score=np.array([3.0, 2, 0, 0, 0, 1]), rule="b > 0.5"
+    attached=np.array([True, False, False, False, False, True]),
+    score=np.array([3.0, 2, 0, 0, 0, 1]),
+    stiffness=np.zeros(6),
+    rule="b > 0.5",
 )
 BELIEF = Belief(mean=np.array([0.9, 0.6, 0, 0, 0, 0.2]), covariance=np.eye(6) * 0.01)
 
@@ -33,6 +36,7 @@ def estimate(index: int) -> Estimate:
         observed=REST + np.array([0, 0, 0.0003]),
         mean=np.maximum(0, BELIEF.mean),
         sd=np.full(6, 0.1),
+        probability=np.full(6, np.nan),
         held=np.zeros(6, bool),
         entropy=5.0 - index,
         nis=1.0,

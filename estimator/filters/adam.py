@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.belief import BoundaryBelief
-from jiggle_mj.estimator.filters.evidence import Evidence, Update
+from jiggle_mj.estimator.filters.evidence import Evidence, Update, not_stated
 from jiggle_mj.estimator.filters.shots import SWEEPS, History, Shots, predicted, simulator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.xpbd import XPBD
@@ -50,6 +50,7 @@ class AdamShooting:
             x=evidence.y,
             b=b,
             sd=none,
+            probability=not_stated(b),
             entropy=none[0],
             nis=none[0],
         )

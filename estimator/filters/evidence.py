@@ -1,9 +1,11 @@
 """What a frame gives to a filter, and what the filter gives back: one interface for all of them."""
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 
 
@@ -33,15 +35,18 @@ class Evidence(eqx.Module):
 
 
 class Update(eqx.Module):
-    """The outcome of one frame; a filter without uncertainty gives a belief, sd, entropy and nis of NaN: not stated."""
+    """The outcome of one frame; what a filter does not state (uncertainty, or P(attached)) is NaN."""
 
-    belief: BoundaryBelief
+    belief: BoundaryBelief | AttachmentBelief
+    """Of the kind that the filter was given."""
     x: Float[Array, "n 3"]
     """State after the update [m]."""
     b: Float[Array, " n"]
     """Non-negative mean [N/m]."""
     sd: Float[Array, " n"]
     """Standard deviation of each b, without the constraint [N/m]."""
+    probability: Float[Array, " n"]
+    """P(attached)."""
     entropy: Float[Array, ""]
     """Of the belief [nat]."""
     nis: Float[Array, ""]
@@ -52,15 +57,18 @@ class Update(eqx.Module):
 class Filter(Protocol):
     """A way to update the belief; it may keep frames of its own for later updates."""
 
-    def update(
-        self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
-    ) -> Update:
+    def update(self, belief: Any, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]) -> Update:
         """Take one frame into the belief.
 
         Args:
-            belief: before the frame.
+            belief: before the frame, of the filter's own kind.
             b: its non-negative mean [N/m].
             evidence: what was seen.
             start: where a search for the state may begin [m].
         """
         ...
+
+
+def not_stated(like: Float[Array, " n"]) -> Float[Array, " n"]:
+    """NaN for every particle."""
+    return jnp.full_like(like, jnp.nan)

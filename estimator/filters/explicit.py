@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
-from jiggle_mj.estimator.filters.evidence import Evidence, Update
+from jiggle_mj.estimator.filters.evidence import Evidence, Update, not_stated
 from jiggle_mj.estimator.filters.shots import SWEEPS, History, Shots, predicted, simulator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.xpbd import XPBD
@@ -66,6 +66,7 @@ class MultipleShooting:
             x=evidence.y,
             b=non_negative(belief, b),
             sd=standard_deviations(factor),
+            probability=not_stated(b),
             entropy=entropy(factor),
             nis=nis,
         )

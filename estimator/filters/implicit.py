@@ -1,262 +1,153 @@
-"""Implicit extended Kalman filter: the measurement model is the equilibrium itself, with an honest force error.
+"""Our filter: each frame's balance of forces is evidence about the bounded stiffness s of every attachment.
 
-    y = x + n_y,  n_y ~ N(0, R)         observed positions, a 3x3 block a particle, no row for a missing one
-    grad U(x; b) = n_f,  n_f ~ N(0, tau^2 I)    what the model gets wrong, in newtons; no row near the grip
-
-Gauss-Newton on (x, b), from the equilibrium of the sheet tethered to what was observed. With H the Hessian of U,
-D = blkdiag(x_i - a_i), W = tau^-2 (0 where loaded), A = R^-1 + H W H and N^-1 = W - W H A^-1 H W, eliminating x leaves
-for b the evidence D^T N^-1 D; each frame enters once. Linear in b at the observed state, so the wild response of a free
-sheet at b = 0 is never needed. Needs correspondences.
+A frame is linearised at the belief of its time and added to it (`force_balance`, `attachment_belief`). A stiff
+attachment shows only once its surroundings are believed stiff: when the jaws open, grasps that were linearised far from
+what is believed now are linearised again, and replace what they said before. Nothing is counted twice.
 """
 
+from dataclasses import dataclass
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sp
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Bool, Float, Int
-from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
-from jiggle_mj.estimator.block_tridiagonal import (
-    BlockCholesky,
-    Layout,
-    add_to_diagonal,
-    assemble,
-    cholesky,
-    lower_square,
-    solve,
-)
-from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.environment import Tether
-from jiggle_mj.estimator.equilibrium import equilibrium
+from jaxtyping import Array, Float
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior, Posterior
 from jiggle_mj.estimator.filters.evidence import Evidence, Update
-from jiggle_mj.estimator.mesh import SheetMesh, pattern
+from jiggle_mj.estimator.filters.force_balance import ForceBalance, Information
+from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
+
+SPIKE, SLAB = 3e-4, (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+"""Widths of s where free, and where attached: from hardly felt to rigid."""
+PROBABILITY, COUPLING = 6.4e-3, 1.8
+"""Of being attached without attached neighbours, and what each adds to the log odds: 2.8 of them make it even."""
+SWEEPS, LAST_SWEEPS = 2, 20
+"""Of the belief after a frame, and when the jaws open."""
+STALE = 0.1
+"""A grasp is linearised again when some s has moved further than this from where it was."""
+PASSES = 3
+"""Over stale grasps, at most, each time that the jaws open."""
 
 
-class ImplicitFilter(eqx.Module):
-    """The filter for one sheet."""
+class ImplicitFilter:
+    """The filter for one sheet, with the grasps so far."""
 
-    energy: SheetEnergy
-    tethered: SheetEnergy
-    """The same, with springs to the observed positions as its last term."""
-    neighbours: Int[Array, "n p"]
-    """Particles coupled to each, itself included, padded with n."""
-    slots: tuple[Int[Array, "_m _p _p"], ...]
-    """Where each term's Hessian windows go in the rows of H."""
-    layout: Layout
-    """Twice the energy's band: the pattern of H^2."""
-    places: Int[Array, "n p p"]
-    force_sd: Float[Array, ""]
-    """tau [N]."""
-    grip_stiffness: Float[Array, ""]
-    """Stiffness of the tethers of held particles [N/m]."""
+    def __init__(self, balance: ForceBalance, prior: AttachmentBelief) -> None:
+        """Take the sheet's balance of forces, and what is believed before the first frame."""
+        self._balance, self.prior = balance, prior
+        self._grasps: list[_Grasp] = []
+        self._between = True
 
-    @classmethod
-    def build(cls, mesh: SheetMesh, energy: SheetEnergy, *, force_sd: float, grip_stiffness: float) -> "ImplicitFilter":
-        """Prepare the index tables for a mesh and its energy; force_sd [N], grip_stiffness [N/m]."""
-        near = sp.csr_array(mesh.adjacency)
-        near.sort_indices()
-        degree = np.diff(near.indptr)
-        neighbours = np.full((mesh.n, degree.max()), -1)
-        column = np.arange(len(near.indices)) - np.repeat(near.indptr[:-1], degree)
-        neighbours[np.repeat(np.arange(mesh.n), degree), column] = near.indices
-        position = {(i, j): k for i, row in enumerate(neighbours.tolist()) for k, j in enumerate(row) if j >= 0}
-        width = neighbours.shape[1]
-        slots = tuple(
-            jnp.asarray([[[i * width + position[i, j] for j in element] for i in element] for element in vertices])
-            for vertices in (np.asarray(term.vertices).tolist() for term in energy.terms)
-        )
-        coupled = sp.csr_array(near.astype(np.int64) @ near.astype(np.int64))
-        layout = Layout.from_pattern(pattern(mesh.n, np.column_stack(coupled.nonzero())), mesh.rest)
-        return cls(
-            energy=energy,
-            tethered=SheetEnergy.build(mesh.rest, (*energy.terms, Tether.build(mesh.rest)), energy.layout),
-            neighbours=jnp.asarray(np.where(neighbours < 0, mesh.n, neighbours)),
-            slots=slots,
-            layout=layout,
-            places=jnp.asarray(layout.pair_index(neighbours)),
-            force_sd=jnp.asarray(force_sd, dtype=float),
-            grip_stiffness=jnp.asarray(grip_stiffness, dtype=float),
-        )
-
-    @eqx.filter_jit
     def update(
-        self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
+        self, belief: AttachmentBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:
-        """See `Filter.update`; the search for the state begins at `start`."""
-        frame = self._approach(self._settle(start, b, evidence), b, evidence)
-        residual, whitened = self._residual(frame)
-        gained, shift = self._information(frame, b, whitened)
-        ahead, belief = belief.mean() - b, belief.add(gained, shift)
-        factor = jnp.linalg.cholesky(belief.precision)
-        nis = self._normalised_innovation(frame, residual, whitened, gained, ahead, factor, evidence)
-        b = belief.non_negative_mean(b > 0)
-        x = self._polish(frame, b, evidence)
-        return Update(belief=belief, x=x, b=b, nis=nis, sd=standard_deviations(factor), entropy=entropy(factor))
+        """See `Filter.update`."""
+        s = belief.bounded(b)
+        update, found = _update(self._balance, belief, s, evidence, start)
+        if np.isfinite(update.x).all() and np.isfinite(update.b).all():
+            if self._between:
+                self._grasps.append(_Grasp(frames=[], precision=jnp.zeros_like(found.precision), shift=0 * s))
+            self._grasps[-1].take(evidence, update.x, found)
+            self._between = False
+        return update
 
-    def _force_weight(self, evidence: Evidence) -> Float[Array, " n"]:
-        return jnp.where(evidence.loaded, 0.0, self.force_sd**-2)
-
-    def _cost(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> Float[Array, ""]:
-        off = evidence.y - x
-        force = jnp.sum(self.energy.gradient(x, b) ** 2, axis=1)
-        seen = jnp.einsum("ni,nij,nj->", off, evidence.precision, off)
-        return 0.5 * (seen + jnp.sum(self._force_weight(evidence) * force))
-
-    def _settle(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
-        """Equilibrium at fixed b of the sheet tethered to the observed positions.
-
-        A tether pulls with tau when a particle is one standard deviation off, so that the outcome nearly balances
-        forces and nearly fits, where the raw observation would be crumpled by its noise far outside the linear range.
-        """
-        sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), 1e-12))
-        pull = (self.force_sd * sd)[:, None, None] * evidence.precision
-        stiff = self.grip_stiffness * jnp.eye(3, dtype=x.dtype)
-        pull = jnp.where(evidence.held[:, None, None], stiff, pull)
-        tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
-        return equilibrium(tethered, b, x, force_tolerance=self.force_sd / 4, max_steps=25).x
-
-    def _approach(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> "_Frame":
-        """Linearise where a Gauss-Newton step on the state alone, at fixed b, gains no more than `SETTLED`."""
-
-        def look(x: Float[Array, "n 3"]) -> tuple["_Frame", Float[Array, "n 3"], Bool[Array, ""]]:
-            frame = self._linearise(x, b, evidence)
-            following, cost = self._best_along(x, self._state_step(frame, x, b, evidence), b, evidence)
-            return frame, following, cost < (1 - SETTLED) * self._cost(x, b, evidence)
-
-        def step(state):
-            _, following, _, count = state
-            return *look(following), count + 1
-
-        def unfinished(state):
-            return state[2] & (state[3] < STATE_STEPS)
-
-        return jax.lax.while_loop(unfinished, step, (*look(x), jnp.asarray(1)))[0]
-
-    def _polish(self, frame: "_Frame", b: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
-        """The state for a new b, by a few steps with the factor at hand."""
-
-        def step(_, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-            return self._best_along(x, self._state_step(frame, x, b, evidence), b, evidence)[0]
-
-        return jax.lax.fori_loop(0, POLISH_STEPS, step, frame.x)
-
-    def _best_along(
-        self, x: Float[Array, "n 3"], move: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence
-    ) -> tuple[Float[Array, "n 3"], Float[Array, ""]]:
-        """The point of least cost among a few along a move, and that cost."""
-        lengths = jnp.array([0.0, 0.1, 0.25, 0.5, 1.0], x.dtype)
-        costs = jax.vmap(lambda length: self._cost(x + length * move, b, evidence))(lengths)
-        best = jnp.nanargmin(costs)
-        return x + lengths[best] * move, costs[best]
-
-    def _rows(self, x: Float[Array, "n 3"], b: Float[Array, " n"]) -> Float[Array, "n p 3 3"]:
-        """H, the windows of each particle's row beside one another."""
-        n, width = self.neighbours.shape
-        rows = jnp.zeros((n * width, 3, 3), x.dtype)
-        for term, slot in zip(self.energy.terms, self.slots, strict=True):
-            windows = jnp.swapaxes(term.hessian(x[term.vertices]), 2, 3).reshape(-1, 3, 3)
-            rows = rows.at[slot.reshape(-1)].add(windows)
-        itself = self.neighbours == jnp.arange(n)[:, None]
-        boundary = jnp.where(itself[:, :, None, None], (b[:, None, None] * jnp.eye(3)[None])[:, None], 0.0)
-        return rows.reshape(n, width, 3, 3) + boundary
-
-    def _linearise(self, x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence) -> "_Frame":
-        rows, weight = self._rows(x, b), self._force_weight(evidence)
-        squares = jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows)
-        matrix = assemble(self.layout, [(self.places, squares)])
-        matrix = add_to_diagonal(self.layout, matrix, evidence.precision + FAINT * jnp.eye(3)[None])
-        return _Frame(
-            x=x,
-            d=x - self.energy.rest,
-            gradient=self.energy.gradient(x, b),
-            rows=rows,
-            weight=weight,
-            factor=cholesky(matrix),
-            off=jnp.where(jnp.trace(evidence.precision, axis1=1, axis2=2)[:, None] > 0, evidence.y - x, 0.0),
-        )
-
-    def _transposed(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """H^T v."""
-        parts = jnp.einsum("npij,ni->npj", rows, v)
-        return jnp.zeros((len(v) + 1, 3), v.dtype).at[self.neighbours].add(parts)[:-1]
-
-    def _state_step(
-        self, frame: "_Frame", x: Float[Array, "n 3"], b: Float[Array, " n"], evidence: Evidence
-    ) -> Float[Array, "n 3"]:
-        """Move of the state at x for fixed b, with the factor of `frame`; Gauss-Newton's if x is its state."""
-        pull = jnp.einsum("nij,nj->ni", evidence.precision, evidence.y - x)
-        gradient = lambda y: self.energy.gradient(y, b)  # noqa: E731
-        push = jax.jvp(gradient, (x,), (frame.weight[:, None] * gradient(x),))[1]
-        return solve(self.layout, frame.factor, pull - push)
-
-    def _information(
-        self, frame: "_Frame", b: Float[Array, " n"], whitened: Float[Array, "n 3"]
-    ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-        """D^T N^-1 D and the shift that goes with it."""
-        layout, w = self.layout, frame.weight
-        spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, frame.d)
-        padded = layout.n_blocks * layout.width
-        slot = jnp.append(layout.slot, padded)[self.neighbours]
-        V = jnp.zeros((padded + 1, 3, padded), spread.dtype).at[slot, :, layout.slot[:, None]].add(spread)[:-1]
-        square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
-        gained = jnp.diag(w * jnp.sum(frame.d**2, axis=1)) - square[layout.slot][:, layout.slot]
-        return gained, gained @ b - jnp.sum(frame.d * whitened, axis=1)
-
-    def _residual(self, frame: "_Frame") -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-        """The unbalanced force e at the observed positions [N], and N^-1 e."""
-        w = frame.weight[:, None]
-        residual = frame.gradient + self._apply(frame.rows, frame.off)
-        back = solve(self.layout, frame.factor, self._transposed(frame.rows, w * residual))
-        return residual, w * (residual - self._apply(frame.rows, back))
-
-    def _normalised_innovation(
-        self,
-        frame: "_Frame",
-        residual: Float[Array, "n 3"],
-        whitened: Float[Array, "n 3"],
-        gained: Float[Array, "n n"],
-        ahead: Float[Array, " n"],
-        posterior: Float[Array, "n n"],
-        evidence: Evidence,
-    ) -> Float[Array, ""]:
-        """e^T (N + D Sigma D^T)^-1 e per degree of freedom, with Sigma from before the frame and e at the mean then.
-
-        That mean lies `ahead` of the b that `residual` is for, so e = residual + D ahead. `posterior` is the Cholesky
-        factor of the precision after the frame. By Woodbury's identity
-        e^T N^-1 e - s^T (Sigma^-1 + D^T N^-1 D)^-1 s with s = D^T N^-1 e.
-        """
-        at_b = jnp.sum(frame.d * whitened, axis=1)
-        squared = jnp.sum(residual * whitened) + ahead @ (2 * at_b + gained @ ahead)
-        s = at_b + gained @ ahead
-        explained = s @ cho_solve((posterior, True), s)
-        observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
-        degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.loaded), 1)
-        return (squared - explained) / degrees.astype(s.dtype)
-
-    def _apply(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """H v."""
-        padded = jnp.concatenate([v, jnp.zeros((1, 3), v.dtype)])
-        return jnp.einsum("npij,npj->ni", rows, padded[self.neighbours])
+    def release(self, belief: AttachmentBelief) -> tuple[AttachmentBelief, Posterior]:
+        """The belief with all grasps linearised again that need it; the next frame begins another grasp."""
+        self._between = True
+        belief, said = _refined(belief)
+        for _ in range(PASSES):
+            stale = [grasp for grasp in self._grasps if grasp.distance(said.mean) > STALE]
+            if not stale:
+                break
+            for grasp in stale:
+                grasp.again(self._balance, said.mean)
+            total = sum(grasp.precision for grasp in self._grasps), sum(grasp.shift for grasp in self._grasps)
+            belief, said = _refined(eqx.tree_at(lambda one: (one.precision, one.shift), belief, total))
+        return belief, said
 
 
-class _Frame(eqx.Module):
-    """The model linearised at a state."""
-
-    x: Float[Array, "n 3"]
-    d: Float[Array, "n 3"]
-    gradient: Float[Array, "n 3"]
-    rows: Float[Array, "n p 3 3"]
-    weight: Float[Array, " n"]
-    factor: BlockCholesky
-    off: Float[Array, "n 3"]
+def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
+    """The prior of a sheet, with b_ref = reference [N/m]."""
+    stiffness = SpikeAndSlab.build(spike=SPIKE, slab=SLAB)
+    prior = AttachmentPrior.build(mesh.n, mesh.edges, stiffness=stiffness, probability=PROBABILITY, coupling=COUPLING)
+    return AttachmentBelief.before(prior, reference=reference)
 
 
-SETTLED = 0.5
-"""A step that lowers the cost by less than this share ends the search for the state."""
-STATE_STEPS = 8
-"""Most Gauss-Newton steps on the state alone, before the one on state and belief."""
-POLISH_STEPS = 2
-"""Steps of the state after the belief has changed."""
-FAINT = 1.0
-"""Precision that keeps unseen, slack particles solvable: a standard deviation of 1 m [1/m^2]."""
+@dataclass
+class _Grasp:
+    """The frames between closing and opening the jaws, and what they say together."""
+
+    frames: list[tuple[Evidence, Float[Array, "n 3"], Float[Array, " n"]]]
+    """What was seen, the state, and the s of the linearisation."""
+    precision: Float[Array, "n n"]
+    shift: Float[Array, " n"]
+
+    def take(self, evidence: Evidence, x: Float[Array, "n 3"], found: Information) -> None:
+        self.frames.append((evidence, x, found.at))
+        self.precision, self.shift = self.precision + found.precision, self.shift + found.shift
+
+    def distance(self, s: Float[Array, " n"]) -> float:
+        """How far s is from where a frame was linearised."""
+        return max(float(jnp.max(jnp.abs(s - at))) for _, _, at in self.frames)
+
+    def again(self, balance: ForceBalance, s: Float[Array, " n"]) -> None:
+        """Linearise all frames at s."""
+        frames, self.frames = self.frames, []
+        self.precision, self.shift = jnp.zeros_like(self.precision), jnp.zeros_like(self.shift)
+        for evidence, x, _ in frames:
+            x, found = _information(balance, x, s, evidence)
+            self.take(evidence, x, found)
+
+
+@eqx.filter_jit
+def _update(
+    balance: ForceBalance,
+    belief: AttachmentBelief,
+    s: Float[Array, " n"],
+    evidence: Evidence,
+    start: Float[Array, "n 3"],
+) -> tuple[Update, Information]:
+    frame = balance.approach(balance.settle(start, s, evidence), s, evidence)
+    found = balance.information(frame)
+    belief = belief.add(found.precision, found.shift)
+    gaussian = belief.gaussian()
+    nis = _normalised_innovation(found, gaussian.factor, evidence)
+    belief = belief.sweep(gaussian).refine(SWEEPS - 1)
+    posterior = belief.posterior()
+    update = Update(
+        belief=belief,
+        x=balance.polish(frame, posterior.mean, evidence),
+        b=posterior.stiffness,
+        sd=posterior.stiffness_sd,
+        probability=posterior.attached,
+        entropy=posterior.entropy,
+        nis=nis,
+    )
+    return update, found
+
+
+@eqx.filter_jit
+def _information(
+    balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
+) -> tuple[Float[Array, "n 3"], Information]:
+    frame = balance.approach(x, s, evidence)
+    return frame.x, balance.information(frame)
+
+
+@eqx.filter_jit
+def _refined(belief: AttachmentBelief) -> tuple[AttachmentBelief, Posterior]:
+    belief = belief.refine(LAST_SWEEPS)
+    return belief, belief.posterior()
+
+
+def _normalised_innovation(found: Information, factor: Float[Array, "n n"], evidence: Evidence) -> Float[Array, ""]:
+    """e^T (N + D Sigma D^T)^-1 e per degree of freedom, with Sigma from before the frame and e at the s of then.
+
+    By Woodbury's identity e^T N^-1 e - p^T (Sigma^-1 + D^T N^-1 D)^-1 p with p = D^T N^-1 e; `factor` is
+    that of the middle matrix.
+    """
+    explained = found.pulled @ cho_solve((factor, True), found.pulled)
+    observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
+    degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.loaded), 1)
+    return (found.squared - explained) / degrees.astype(explained.dtype)

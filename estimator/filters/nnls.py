@@ -18,7 +18,7 @@ from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviati
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Tether
 from jiggle_mj.estimator.equilibrium import equilibrium
-from jiggle_mj.estimator.filters.evidence import Evidence, Update
+from jiggle_mj.estimator.filters.evidence import Evidence, Update, not_stated
 
 
 class NonNegativeLeastSquares(eqx.Module):
@@ -58,6 +58,7 @@ class NonNegativeLeastSquares(eqx.Module):
             x=x,
             b=after.non_negative_mean(b > 0),
             sd=standard_deviations(factor),
+            probability=not_stated(b),
             entropy=entropy(factor),
             nis=(jnp.sum(innovation) - explained) / degrees,
         )

@@ -24,7 +24,7 @@ from jiggle_mj.estimator.belief import BoundaryBelief, entropy, non_negative_min
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
-from jiggle_mj.estimator.filters.evidence import Evidence, Update
+from jiggle_mj.estimator.filters.evidence import Evidence, Update, not_stated
 from jiggle_mj.estimator.mesh import SheetMesh
 from scipy.cluster.vq import kmeans2
 
@@ -81,6 +81,7 @@ class ReducedUnscented:
             x=x,
             b=theta[patch],
             sd=jnp.sqrt(variance[patch]),
+            probability=not_stated(b),
             entropy=entropy(jnp.linalg.cholesky(marginals.precision)),
             nis=nis,
         )

@@ -26,14 +26,15 @@
     yaxis: { range: range(1), title: { text: `${across} [mm]`, standoff: 4 }, zeroline: false, gridcolor: "#eef1f4", scaleanchor: "x", constrain: "domain" },
   };
   const bar = (title) => ({ orientation: "h", x: 0.5, xanchor: "center", y: -0.2, yanchor: "top", thickness: 9, len: 0.96, outlinewidth: 0, title: { text: title, side: "bottom" }, nticks: 5 });
-  const field = (id, grid, scale, top, title) => {
+  const field = (id, grid, scale, top, title, unit = " N/m") => {
     const traces = [{ type: "heatmap", x: data.grids.x, y: data.grids.y, z: grid, colorscale: scale, zmin: 0, zmax: top, hoverongaps: false,
-      colorbar: bar(title), hovertemplate: `${along} %{x:.1f}, ${across} %{y:.1f} mm<br>%{z:.3g} N/m<extra></extra>` }];
+      colorbar: bar(title), hovertemplate: `${along} %{x:.1f}, ${across} %{y:.1f} mm<br>%{z:.3g}${unit}<extra></extra>` }];
     if (border) traces.push(border("#1d2733", 3.2), border("#ffffff", 1.4));
     Plotly.newPlot(id, traces, flatLayout, still);
   };
   field("map-mean", data.grids.mean, scales.b, data.top_b, "mean b [N/m]");
   field("map-sd", data.grids.sd, scales.sd, data.top_sd, "sd of b [N/m]");
+  if (data.grids.probability) field("map-probability", data.grids.probability, scales.b, 1, "P(attached)", "");
   if (truth) field("map-truth", data.grids.truth, scales.b, data.top_b, "b* [N/m]");
 
   const kinds = truth

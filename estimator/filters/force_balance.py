@@ -1,0 +1,270 @@
+"""What one frame says of the bounded stiffness s of every attachment, through the sheet's balance of forces.
+
+    y = x + n_y,  n_y ~ N(0, R)      observed positions, a 3x3 block a particle, no row for a missing one
+    r(x; s) = n_f                    forces balance up to what the model gets wrong; no row near the grip
+
+With s = b / (b + b_ref), f the gradient of the sheet's own energy and d = x - a, the balance f + b d = 0 times 1 - s is
+
+    r = (1 - s) f + s b_ref d,       n_f ~ N(0, (1 - s)^2 tau^2 + (s b_ref sigma_a)^2),
+
+which at s = 1 is a weld, x = a, and stays sensitive there: D = dr/ds = b_ref d - f holds the reaction force. With
+H = dr/dx, W = cov(n_f)^-1 (0 where loaded), A = R^-1 + H^T W H and N^-1 = W - W H A^-1 H^T W, eliminating x leaves for
+s the evidence D^T N^-1 D. Linear in s at the observed state, so the wild response of a free sheet is never needed.
+Needs correspondences.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float, Int
+from jiggle_mj.estimator.block_tridiagonal import (
+    BlockCholesky,
+    Layout,
+    add_to_diagonal,
+    assemble,
+    cholesky,
+    lower_square,
+    solve,
+)
+from jiggle_mj.estimator.energy import SheetEnergy
+from jiggle_mj.estimator.environment import Tether
+from jiggle_mj.estimator.equilibrium import equilibrium
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.mesh import SheetMesh, pattern
+
+
+class ForceBalance(eqx.Module):
+    """The balance of forces of one sheet, to be linearised at any state."""
+
+    energy: SheetEnergy
+    tethered: SheetEnergy
+    """The same, with springs to the observed positions as its last term."""
+    neighbours: Int[Array, "n p"]
+    """Particles coupled to each, itself included, padded with n."""
+    slots: tuple[Int[Array, "_m _p _p"], ...]
+    """Where each term's Hessian windows go in the rows of H."""
+    layout: Layout
+    """Twice the energy's band: the pattern of H^T H."""
+    places: Int[Array, "n p p"]
+    force_sd: Float[Array, ""]
+    """tau [N]."""
+    anchor_sd: Float[Array, ""]
+    """sigma_a, how far a welded particle may be from its anchor [m]."""
+    reference: Float[Array, ""]
+    """b_ref [N/m]."""
+    grip_stiffness: Float[Array, ""]
+    """Stiffness of the tethers of held particles [N/m]."""
+
+    @classmethod
+    def build(
+        cls,
+        mesh: SheetMesh,
+        energy: SheetEnergy,
+        *,
+        reference: float,
+        force_sd: float,
+        anchor_sd: float,
+        grip_stiffness: float,
+    ) -> "ForceBalance":
+        """Prepare the index tables for a mesh and its energy; reference and grip_stiffness [N/m]."""
+        near = sp.csr_array(mesh.adjacency)
+        near.sort_indices()
+        degree = np.diff(near.indptr)
+        neighbours = np.full((mesh.n, degree.max()), -1)
+        column = np.arange(len(near.indices)) - np.repeat(near.indptr[:-1], degree)
+        neighbours[np.repeat(np.arange(mesh.n), degree), column] = near.indices
+        position = {(i, j): k for i, row in enumerate(neighbours.tolist()) for k, j in enumerate(row) if j >= 0}
+        width = neighbours.shape[1]
+        slots = tuple(
+            jnp.asarray([[[i * width + position[i, j] for j in element] for i in element] for element in vertices])
+            for vertices in (np.asarray(term.vertices).tolist() for term in energy.terms)
+        )
+        coupled = sp.csr_array(near.astype(np.int64) @ near.astype(np.int64))
+        layout = Layout.from_pattern(pattern(mesh.n, np.column_stack(coupled.nonzero())), mesh.rest)
+        return cls(
+            energy=energy,
+            tethered=SheetEnergy.build(mesh.rest, (*energy.terms, Tether.build(mesh.rest)), energy.layout),
+            neighbours=jnp.asarray(np.where(neighbours < 0, mesh.n, neighbours)),
+            slots=slots,
+            layout=layout,
+            places=jnp.asarray(layout.pair_index(neighbours)),
+            force_sd=jnp.asarray(force_sd, dtype=float),
+            anchor_sd=jnp.asarray(anchor_sd, dtype=float),
+            reference=jnp.asarray(reference, dtype=float),
+            grip_stiffness=jnp.asarray(grip_stiffness, dtype=float),
+        )
+
+    def settle(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
+        """Equilibrium at fixed s of the sheet tethered to the observed positions, searched from x.
+
+        A tether pulls with tau when a particle is one standard deviation off, so that the outcome nearly balances
+        forces and nearly fits, where the raw observation would be crumpled by its noise far outside the linear range.
+        """
+        sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), 1e-12))
+        pull = (self.force_sd * sd)[:, None, None] * evidence.precision
+        stiff = self.grip_stiffness * jnp.eye(3, dtype=x.dtype)
+        pull = jnp.where(evidence.held[:, None, None], stiff, pull)
+        tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
+        b = self.reference * s / (1 - s)
+        return equilibrium(tethered, b, x, force_tolerance=self.force_sd, max_steps=25).x
+
+    def approach(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> "Frame":
+        """Linearise where a Gauss-Newton step on the state alone, at fixed s, gains no more than `SETTLED`."""
+
+        def step(state):
+            _, x, _, count = state
+            frame = self.linearise(x, s, evidence)
+            following, cost = self._best_along(x, self._state_step(frame, x, s, evidence), s, evidence)
+            return frame, following, cost < (1 - SETTLED) * self._cost(x, s, evidence), count + 1
+
+        def unfinished(state):
+            return state[2] & (state[3] < STATE_STEPS)
+
+        shapes = jax.eval_shape(lambda: self.linearise(x, s, evidence))
+        unlooked = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
+        return jax.lax.while_loop(unfinished, step, (unlooked, x, jnp.asarray(True), jnp.asarray(0)))[0]
+
+    def polish(self, frame: "Frame", s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
+        """The state for a new s, by a few steps with the factor at hand."""
+
+        def step(_, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+            return self._best_along(x, self._state_step(frame, x, s, evidence), s, evidence)[0]
+
+        return jax.lax.fori_loop(0, POLISH_STEPS, step, frame.x)
+
+    def linearise(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> "Frame":
+        """The balance of forces around x and s."""
+        rows, weight = self._rows(x, s), self._weight(s, evidence)
+        squares = jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows)
+        matrix = assemble(self.layout, [(self.places, squares)])
+        matrix = add_to_diagonal(self.layout, matrix, evidence.precision + FAINT * jnp.eye(3)[None])
+        return Frame(
+            x=x,
+            s=s,
+            unbalanced=self._unbalanced(x, s),
+            slope=self.reference * (x - self.energy.rest) - self.energy.internal_gradient(x),
+            rows=rows,
+            weight=weight,
+            factor=cholesky(matrix),
+            off=jnp.where(jnp.trace(evidence.precision, axis1=1, axis2=2)[:, None] > 0, evidence.y - x, 0.0),
+        )
+
+    def information(self, frame: "Frame") -> "Information":
+        """What the frame says of s, with its state eliminated."""
+        layout, w = self.layout, frame.weight
+        residual = frame.unbalanced + self._apply(frame.rows, frame.off)
+        back = solve(layout, frame.factor, self._transposed(frame.rows, w[:, None] * residual))
+        whitened = w[:, None] * (residual - self._apply(frame.rows, back))
+        spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, frame.slope)
+        padded = layout.n_blocks * layout.width
+        slot = jnp.append(layout.slot, padded)[self.neighbours]
+        V = jnp.zeros((padded + 1, 3, padded), spread.dtype).at[slot, :, layout.slot[:, None]].add(spread)[:-1]
+        square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
+        precision = jnp.diag(w * jnp.sum(frame.slope**2, axis=1)) - square[layout.slot][:, layout.slot]
+        pulled = -jnp.sum(frame.slope * whitened, axis=1)
+        return Information(precision=precision, pulled=pulled, squared=jnp.sum(residual * whitened), at=frame.s)
+
+    def _weight(self, s: Float[Array, " n"], evidence: Evidence) -> Float[Array, " n"]:
+        variance = ((1 - s) * self.force_sd) ** 2 + (s * self.reference * self.anchor_sd) ** 2
+        return jnp.where(evidence.loaded, 0.0, 1 / variance)
+
+    def _unbalanced(self, x: Float[Array, "n 3"], s: Float[Array, " n"]) -> Float[Array, "n 3"]:
+        """R [N]."""
+        internal, d = self.energy.internal_gradient(x), x - self.energy.rest
+        return (1 - s)[:, None] * internal + (s * self.reference)[:, None] * d
+
+    def _cost(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, ""]:
+        off = evidence.y - x
+        force = jnp.sum(self._unbalanced(x, s) ** 2, axis=1)
+        seen = jnp.einsum("ni,nij,nj->", off, evidence.precision, off)
+        return 0.5 * (seen + jnp.sum(self._weight(s, evidence) * force))
+
+    def _best_along(
+        self, x: Float[Array, "n 3"], move: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
+    ) -> tuple[Float[Array, "n 3"], Float[Array, ""]]:
+        """The point of least cost among a few along a move, and that cost."""
+        lengths = jnp.array([0.0, 0.1, 0.25, 0.5, 1.0], x.dtype)
+        costs = jax.vmap(lambda length: self._cost(x + length * move, s, evidence))(lengths)
+        best = jnp.nanargmin(costs)
+        return x + lengths[best] * move, costs[best]
+
+    def _rows(self, x: Float[Array, "n 3"], s: Float[Array, " n"]) -> Float[Array, "n p 3 3"]:
+        """H, the windows of each particle's row beside one another."""
+        n, width = self.neighbours.shape
+        rows = jnp.zeros((n * width, 3, 3), x.dtype)
+        for term, slot in zip(self.energy.terms, self.slots, strict=True):
+            windows = jnp.swapaxes(term.hessian(x[term.vertices]), 2, 3).reshape(-1, 3, 3)
+            rows = rows.at[slot.reshape(-1)].add(windows)
+        itself = self.neighbours == jnp.arange(n)[:, None]
+        anchored = (s * self.reference)[:, None, None] * jnp.eye(3)[None]
+        boundary = jnp.where(itself[:, :, None, None], anchored[:, None], 0.0)
+        return (1 - s)[:, None, None, None] * rows.reshape(n, width, 3, 3) + boundary
+
+    def _transposed(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """H^T v."""
+        parts = jnp.einsum("npij,ni->npj", rows, v)
+        return jnp.zeros((len(v) + 1, 3), v.dtype).at[self.neighbours].add(parts)[:-1]
+
+    def _apply(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """H v."""
+        padded = jnp.concatenate([v, jnp.zeros((1, 3), v.dtype)])
+        return jnp.einsum("npij,npj->ni", rows, padded[self.neighbours])
+
+    def _state_step(
+        self, frame: "Frame", x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
+    ) -> Float[Array, "n 3"]:
+        """Move of the state at x for fixed s, with the factor of `frame`; Gauss-Newton's if x and s are its own."""
+        pull = jnp.einsum("nij,nj->ni", evidence.precision, evidence.y - x)
+        push = jax.vjp(lambda y: self._unbalanced(y, s), x)[1](
+            self._weight(s, evidence)[:, None] * self._unbalanced(x, s)
+        )[0]
+        return solve(self.layout, frame.factor, pull - push)
+
+
+class Frame(eqx.Module):
+    """The model linearised at a state."""
+
+    x: Float[Array, "n 3"]
+    s: Float[Array, " n"]
+    unbalanced: Float[Array, "n 3"]
+    """r [N]."""
+    slope: Float[Array, "n 3"]
+    """D [N]."""
+    rows: Float[Array, "n p 3 3"]
+    """H [N/m]."""
+    weight: Float[Array, " n"]
+    """W [1/N^2]."""
+    factor: BlockCholesky
+    """Of A."""
+    off: Float[Array, "n 3"]
+    """y - x, zero where nothing was seen [m]."""
+
+
+class Information(eqx.Module):
+    """What a frame says of s."""
+
+    precision: Float[Array, "n n"]
+    """D^T N^-1 D."""
+    pulled: Float[Array, " n"]
+    """-D^T N^-1 e with e = r + H (y - x), at the s of the linearisation."""
+    squared: Float[Array, ""]
+    """e^T N^-1 e."""
+    at: Float[Array, " n"]
+    """s of the linearisation."""
+
+    @property
+    def shift(self) -> Float[Array, " n"]:
+        """The information form's other half."""
+        return self.pulled + self.precision @ self.at
+
+
+SETTLED = 0.5
+"""A step that lowers the cost by less than this share ends the search for the state."""
+STATE_STEPS = 8
+"""Most Gauss-Newton steps on the state alone, before the one on state and belief."""
+POLISH_STEPS = 1
+"""Steps of the state after the belief has changed."""
+FAINT = 1.0
+"""Precision that keeps unseen, slack particles solvable: a standard deviation of 1 m [1/m^2]."""

@@ -1,0 +1,101 @@
+"""One particle's bounded stiffness s in [0, 1]: free or attached a priori, and what a Gaussian measurement leaves.
+
+The prior is a spike and a slab [Mitchell & Beauchamp 1988, doi:10.1080/01621459.1988.10478694]: free is a half-normal
+too narrow to matter, attached an even mixture of half-normals of several widths, all cut off at 1. Times a Gaussian
+each part is a truncated normal, so that odds, moments and quantiles are closed forms.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import log_ndtr, logsumexp, ndtr
+from jax.scipy.stats import norm
+from jaxtyping import Array, Float
+
+BISECTIONS = 50
+
+
+class Mixture(eqx.Module):
+    """Normals truncated to [0, 1]; the first is the spike."""
+
+    weight: Float[Array, "c n"]
+    """Sums to 1 over the parts."""
+    mean: Float[Array, "c n"]
+    """Of each normal before it is truncated."""
+    sd: Float[Array, "c n"]
+
+    @property
+    def attached(self) -> Float[Array, " n"]:
+        """Probability of the slab."""
+        return jnp.sum(self.weight[1:], axis=0)
+
+    def moments(self) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """Mean and variance."""
+        below, above = -self.mean / self.sd, (1 - self.mean) / self.sd
+        mass = _log_mass(below, above)
+        at_zero, at_one = jnp.exp(norm.logpdf(below) - mass), jnp.exp(norm.logpdf(above) - mass)
+        means = self.mean + self.sd * (at_zero - at_one)
+        shares = 1 + below * at_zero - above * at_one - (at_zero - at_one) ** 2
+        second = self.sd**2 * jnp.maximum(shares, 0) + means**2
+        mean = jnp.sum(self.weight * means, axis=0)
+        return mean, jnp.sum(self.weight * second, axis=0) - mean**2
+
+    def quantile(self, probability: float) -> Float[Array, " n"]:
+        """The s below which lies the given probability."""
+        below = -self.mean / self.sd
+        mass = _log_mass(below, (1 - self.mean) / self.sd)
+
+        def halve(_, bounds):
+            low, high = bounds
+            middle = (low + high) / 2
+            share = jnp.exp(_log_mass(below, (middle[None] - self.mean) / self.sd) - mass)
+            less = jnp.sum(self.weight * share, axis=0) < probability
+            return jnp.where(less, middle, low), jnp.where(less, high, middle)
+
+        n = self.mean.shape[1]
+        return jax.lax.fori_loop(0, BISECTIONS, halve, (jnp.zeros(n), jnp.ones(n)))[1]
+
+
+class SpikeAndSlab(eqx.Module):
+    """The prior."""
+
+    spike: Float[Array, ""]
+    """Standard deviation of s where free."""
+    slab: Float[Array, " _c"]
+    """Widths of the half-normals where attached."""
+
+    @classmethod
+    def build(cls, *, spike: float, slab: tuple[float, ...]) -> "SpikeAndSlab":
+        """From the widths, all above 0."""
+        return cls(spike=jnp.asarray(spike, dtype=float), slab=jnp.asarray(slab, dtype=float))
+
+    def posterior(
+        self, mean: Float[Array, " n"], variance: Float[Array, " n"], log_odds: Float[Array, " n"]
+    ) -> tuple[Mixture, Float[Array, " n"]]:
+        """After measurements of s, and the log Bayes factor of 'attached' against 'free'.
+
+        Args:
+            mean: measured s, anywhere.
+            variance: of the measurements.
+            log_odds: of 'attached' beforehand.
+        """
+        width = jnp.concatenate([self.spike[None], self.slab])[:, None] ** 2
+        mean, variance = mean[None], variance[None]
+        narrowed = 1 / (1 / variance + 1 / width)
+        parts = Mixture(weight=narrowed, mean=narrowed * mean / variance, sd=jnp.sqrt(narrowed))
+        seen = norm.logpdf(mean, 0, jnp.sqrt(variance + width))
+        mass = _log_mass(-parts.mean / parts.sd, (1 - parts.mean) / parts.sd)
+        evidence = seen + mass - jnp.log(ndtr(1 / jnp.sqrt(width)) - 0.5)
+        of_slab = logsumexp(evidence[1:], axis=0) - jnp.log(jnp.asarray(len(self.slab), dtype=mean.dtype))
+        factor = of_slab - evidence[0]
+        attached = jax.nn.sigmoid(log_odds + factor)[None]
+        weight = jnp.concatenate([1 - attached, attached * jax.nn.softmax(evidence[1:], axis=0)])
+        return eqx.tree_at(lambda parts: parts.weight, parts, weight), factor
+
+
+def _log_mass(below: Float[Array, "c n"], above: Float[Array, "c n"]) -> Float[Array, "c n"]:
+    """Log of the standard normal's mass between two numbers, also far out in either tail."""
+    mirrored = below > 0
+    low, high = jnp.where(mirrored, -above, below), jnp.where(mirrored, -below, above)
+    log_high = log_ndtr(high)
+    return log_high + jnp.log1p(-jnp.exp(jnp.minimum(log_ndtr(low) - log_high, -1e-300)))

@@ -1,0 +1,199 @@
+"""How long the estimator's parts take, and what one of them finds: the same sheet lifted at a corner, at several sizes.
+
+Each time is a median over repeats of a call that was compiled before; compile time stands apart. The sheet is the
+estimator's own engine's, so that nothing but the estimator is needed (no MuJoCo), on whatever device JAX has.
+"""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.resources import files
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from jiggle_mj.estimator import EstimatorConfig
+from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.energy import SheetEnergy
+from jiggle_mj.estimator.environment import Grip
+from jiggle_mj.estimator.equilibrium import equilibrium
+from jiggle_mj.estimator.filters.evidence import Evidence, Pull
+from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
+from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.surrogate import surrogate
+
+from jiggle_mj.observation import Declaration
+
+NOISE = 2e-4
+"""Standard deviation of each observed coordinate [m]."""
+STIFFNESS, RADIUS = 1.0, 0.015
+"""Of each attached particle [N/m], and of the attached disc [m]."""
+LIFT, STEP = 0.03, 0.005
+"""Height of the lifted corner, and by how much it rose since the frame before [m]."""
+GRIP = 6e-3
+"""Radius of the jaws [m]."""
+REPEATS = 7
+SLOWER, WORSE = 3.0, 0.02
+"""What the gate lets pass: a time this many times the baseline's, and a share found that is lower by this much."""
+Metrics = dict[str, dict[str, float | str]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One sheet of about n particles, and one frame of a lift."""
+
+    mesh: SheetMesh
+    declaration: Declaration
+    energy: SheetEnergy
+    gripped: SheetEnergy
+    """With the jaws at the frame's place."""
+    before: Float[Array, "n 3"]
+    """Equilibrium one step before the frame [m]."""
+    evidence: Evidence
+    attached: Bool[np.ndarray, " n"]
+    b: Float[Array, " n"]
+
+
+def square(n: int) -> SheetMesh:
+    """About n particles, equilateral, at the default spacing."""
+    columns = round(np.sqrt(n * np.sqrt(0.75)))
+    rows = round(n / columns)
+    place = [(i + 0.5 * (j % 2), j * np.sqrt(0.75), 0.0) for j in range(rows) for i in range(columns)]
+    faces = []
+    for j in range(rows - 1):
+        for i in range(columns - 1):
+            a, b, c, d = j * columns + i, j * columns + i + 1, (j + 1) * columns + i, (j + 1) * columns + i + 1
+            faces += [(a, b, d), (a, d, c)] if j % 2 else [(a, b, c), (b, d, c)]
+    rest = EstimatorConfig().spacing * np.array(place)
+    return SheetMesh(rest - rest.mean(axis=0), np.array(faces))
+
+
+def case(n: int) -> Case:
+    """Lift a corner of a sheet with an attached disc in the middle of the lifted part."""
+    mesh, declaration = square(n), Declaration()
+    corner = mesh.rest[np.argmin(mesh.rest @ np.array([1.0, 1.0, 0.0]))]
+    attached = np.linalg.norm(mesh.rest - corner - np.array([0.03, 0.03, 0.0]), axis=1) < RADIUS
+    energy, b = surrogate(mesh, declaration), jnp.asarray(STIFFNESS * attached)
+    stiff = EstimatorConfig().grip_stiffness * declaration.membrane_stiffness
+    grip = Grip.build(jnp.asarray(mesh.rest), jnp.asarray(corner), radius=GRIP, stiffness=stiff)
+    gripped = SheetEnergy.build(mesh.rest, (*energy.terms, grip), energy.layout)
+    search, x, before = eqx.filter_jit(equilibrium), jnp.asarray(mesh.rest), jnp.asarray(mesh.rest)
+    for height in np.arange(STEP, LIFT + STEP / 2, STEP):
+        before, tip = x, corner + np.array([0.3 * height, 0.3 * height, height])
+        grip = eqx.tree_at(lambda one: one.tip, grip, jnp.asarray(tip))
+        gripped = eqx.tree_at(lambda one: one.terms[-1], gripped, grip)
+        x = search(gripped, b, x, force_tolerance=1e-6).x
+    held = grip.stiffness > 0
+    noisy = x + NOISE * jnp.asarray(np.random.default_rng(0).normal(size=x.shape))
+    precision = jnp.broadcast_to(jnp.eye(3) / NOISE**2, (mesh.n, 3, 3))
+    pull = Pull(before=before, tip=grip.tip, length=grip.length)
+    evidence = Evidence(y=noisy, precision=precision, held=held, loaded=held, pull=pull)
+    return Case(
+        mesh=mesh,
+        declaration=declaration,
+        energy=energy,
+        gripped=gripped,
+        before=before,
+        evidence=evidence,
+        attached=attached,
+        b=b,
+    )
+
+
+def benchmark(sizes: tuple[int, ...], *, explicit: bool, say: Callable[[str], None]) -> Metrics:
+    """Times of the update and the equilibrium at each size, and of the paper's filter at the first.
+
+    Args:
+        sizes: particles, about.
+        explicit: measure the paper's filter too, which takes minutes on a CPU.
+        say: told what comes next.
+    """
+    metrics: Metrics = {"device": {"value": jax.devices()[0].device_kind, "unit": "name"}}
+    with jax.enable_x64(True), one_thread():
+        for n in sizes:
+            say(f"n = {n}")
+            one = case(n)
+            compiled, seconds = timed(_equilibrium(one))
+            metrics[f"equilibrium_n{n}_s"] = {"value": seconds, "unit": "s"}
+            update = _implicit(one)
+            compiled, seconds = timed(update)
+            metrics[f"update_n{n}_s"] = {"value": seconds, "unit": "s"}
+            metrics[f"update_n{n}_compile_s"] = {"value": compiled, "unit": "s"}
+            if n == sizes[0]:
+                found = np.asarray(update().probability) > 0.5
+                metrics["found_share"] = {"value": float(np.mean(found == one.attached)), "unit": "share"}
+            if explicit and n == sizes[0]:
+                say(f"n = {n}, the paper's filter")
+                _, slow = timed(_explicit(one), repeats=3)
+                metrics[f"update_explicit_n{n}_s"] = {"value": slow, "unit": "s"}
+                metrics["update_explicit_over_implicit"] = {"value": slow / seconds, "unit": "ratio"}
+    if len(sizes) > 1:
+        times = [float(metrics[f"update_n{n}_s"]["value"]) for n in sizes]
+        slope = np.polyfit(np.log(sizes), np.log(times), 1)[0]
+        metrics["update_exponent"] = {"value": float(slope), "unit": "exponent of n"}
+    return metrics
+
+
+def timed(call: Callable[[], object], *, repeats: int = REPEATS) -> tuple[float, float]:
+    """Seconds that the first call takes longer than the median of the others, and that median."""
+    seconds = []
+    for _ in range(repeats + 1):
+        began = time.perf_counter()
+        jax.block_until_ready(call())
+        seconds.append(time.perf_counter() - began)
+    median = float(np.median(seconds[1:]))
+    return max(seconds[0] - median, 0.0), median
+
+
+def regressions(metrics: Metrics, baseline: Metrics) -> list[str]:
+    """What became worse than the baseline allows, in words."""
+    worse = []
+    for name, entry in baseline.items():
+        if name not in metrics or entry["unit"] not in ("s", "share") or "compile" in name:
+            continue
+        now, then = float(metrics[name]["value"]), float(entry["value"])
+        if entry["unit"] == "s" and now > SLOWER * then:
+            worse.append(f"{name} is {now:.3g} s; the baseline is {then:.3g} s, and {SLOWER:g} times that is allowed.")
+        if entry["unit"] == "share" and now < then - WORSE:
+            worse.append(f"{name} is {now:.3f}; the baseline is {then:.3f}, and {WORSE:g} less is allowed.")
+    return worse
+
+
+def baseline() -> Metrics:
+    """The committed one, of two CPU cores."""
+    return json.loads((files("jiggle_mj.eval") / "benchmark_baseline.json").read_text("utf-8"))
+
+
+def _equilibrium(one: Case) -> Callable[[], object]:
+    tolerance = EstimatorConfig().force_sd * one.declaration.membrane_stiffness * one.mesh.spacing / 4
+    search = eqx.filter_jit(equilibrium)
+    return lambda: search(one.gripped, one.b, one.before, force_tolerance=tolerance).x
+
+
+def _implicit(one: Case):
+    config, k = EstimatorConfig(), one.declaration.membrane_stiffness
+    balance = ForceBalance.build(
+        one.mesh,
+        one.energy,
+        reference=config.reference * k,
+        force_sd=config.force_sd * k * one.mesh.spacing,
+        anchor_sd=config.anchor_sd,
+        grip_stiffness=config.grip_stiffness * k,
+    )
+    prior = prior_belief(one.mesh, reference=config.reference * k)
+    nothing = jnp.zeros(one.mesh.n)
+    return lambda: ImplicitFilter(balance, prior).update(prior, nothing, one.evidence, one.before)
+
+
+def _explicit(one: Case) -> Callable[[], object]:
+    config, k = EstimatorConfig(), one.declaration.membrane_stiffness
+    prior = BoundaryBelief.prior(one.mesh.n, mean=PRIOR_MEAN, sd=config.prior_sd * k)
+    nothing = jnp.zeros(one.mesh.n)
+    shooting = MultipleShooting(one.mesh, one.declaration, grip_stiffness=config.grip_stiffness * k, samples=1)
+    return lambda: shooting.update(prior, nothing, one.evidence, one.before)

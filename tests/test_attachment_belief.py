@@ -1,0 +1,102 @@
+"""Expectation and belief propagation against what can be summed or integrated exactly."""
+
+from itertools import product
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior
+from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
+from scipy.special import expit, logit
+
+STIFFNESS = SpikeAndSlab.build(spike=3e-3, slab=(0.03, 0.3))
+PROBABILITY, REFERENCE = 0.1, 30.0
+
+
+def chain(n: int, *, coupling: float) -> AttachmentBelief:
+    """Particles in a row, nothing seen."""
+    edges = np.column_stack([np.arange(n - 1), np.arange(1, n)])
+    prior = AttachmentPrior.build(n, edges, stiffness=STIFFNESS, probability=PROBABILITY, coupling=coupling)
+    return AttachmentBelief.before(prior, reference=REFERENCE)
+
+
+def alone(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Moments of particles without neighbours, measured independently."""
+    odds = jnp.full(len(mean), logit(PROBABILITY))
+    means, variances = STIFFNESS.posterior(jnp.asarray(mean), jnp.asarray(variance), odds)[0].moments()
+    return np.asarray(means), np.asarray(variances)
+
+
+def test_independent_measurements_give_each_particle_its_own_posterior():
+    mean, variance = np.array([0.0, 0.02, 0.15, 0.9]), np.array([1e-5, 1e-4, 1e-4, 1e-2])
+    belief = chain(4, coupling=0.0).add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)).refine(30)
+    expected, spread = alone(mean, variance)
+    posterior = belief.posterior()
+    np.testing.assert_allclose(posterior.mean, expected, rtol=1e-6)
+    np.testing.assert_allclose(posterior.sd**2, spread, rtol=1e-6)
+
+
+def test_odds_along_a_chain_are_exact():
+    """Belief propagation on a tree: against the sum over all 2^n states."""
+    n, coupling = 5, 1.5
+    mean, variance = np.array([0.0, 0.01, 0.012, 0.0, 0.05]), np.full(5, 3e-5)
+    belief = chain(n, coupling=coupling)
+    belief = belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)).refine(60)
+    log_odds = jnp.full(n, logit(PROBABILITY))
+    factor = np.asarray(STIFFNESS.posterior(jnp.asarray(mean), jnp.asarray(variance), log_odds)[1])
+    total, attached = 0.0, np.zeros(n)
+    for state in product((0, 1), repeat=n):
+        a = np.array(state)
+        weight = np.exp(a @ (logit(PROBABILITY) + factor) + coupling * np.sum(a[1:] * a[:-1]))
+        total += weight
+        attached += weight * a
+    np.testing.assert_allclose(belief.posterior().attached, attached / total, rtol=1e-6)
+
+
+def test_two_particles_that_share_a_load():
+    """Only their sum is measured, so that either may carry it: the mean against integration over the square. A Gaussian
+    cannot have two peaks; the spread that it states instead is not too small."""
+    total, variance, faint = 0.2, 1e-4, 1e-3
+    precision = np.full((2, 2), 1 / variance) + faint * np.eye(2)
+    belief = chain(2, coupling=0.0).add(jnp.asarray(precision), jnp.asarray(np.full(2, total / variance))).refine(60)
+    s = np.concatenate([np.linspace(0, 0.02, 400, endpoint=False), np.linspace(0.02, 0.5, 1200)])
+    half = [np.exp(-0.5 * (s / width) ** 2) / width for width in (3e-3, 0.03, 0.3)]
+    prior = (1 - PROBABILITY) * half[0] + PROBABILITY * (half[1] + half[2]) / 2
+    joint = np.exp(-0.5 * (s[:, None] + s[None] - total) ** 2 / variance) * prior[:, None] * prior[None]
+    joint /= np.trapezoid(np.trapezoid(joint, s, axis=1), s)
+    expected = np.trapezoid(np.trapezoid(joint, s, axis=1) * s, s)
+    posterior = belief.posterior()
+    np.testing.assert_allclose(posterior.mean, expected, rtol=0.05)
+    np.testing.assert_allclose(posterior.mean.sum(), total, atol=0.01)
+    spread = np.sqrt(np.trapezoid(np.trapezoid(joint, s, axis=1) * (s - expected) ** 2, s))
+    assert (spread < np.asarray(posterior.sd)).all() and (np.asarray(posterior.sd) < 1.5 * spread).all()
+
+
+def test_what_nothing_was_seen_of_stays_at_the_prior():
+    belief = chain(3, coupling=0.0)
+    seen = belief.add(jnp.diag(jnp.array([1e6, 0.0, 0.0])), jnp.array([1e5, 0.0, 0.0])).refine(30)
+    assert float(seen.posterior().attached[0]) > 0.99
+    np.testing.assert_allclose(seen.posterior().attached[1:], PROBABILITY, rtol=1e-6)
+    assert float(belief.entropy()) > float(seen.entropy())
+
+
+def test_an_attached_neighbour_raises_the_odds():
+    """One that is certain multiplies them by e^J."""
+    coupling = 1.2
+    belief = chain(2, coupling=coupling).add(jnp.diag(jnp.array([1e6, 0.0])), jnp.array([3e5, 0.0])).refine(60)
+    assert float(belief.posterior().attached[1]) == pytest.approx(expit(logit(PROBABILITY) + coupling), rel=1e-6)
+
+
+def test_intervals_open_upwards_where_only_a_lower_end_is_known():
+    mean, sd = np.array([0.0, 0.1, 0.99]), np.array([1e-3, 5e-3, 5e-2])
+    belief = chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2)).refine(30)
+    lower, upper = (np.asarray(end) for end in belief.interval())
+    assert lower[0] == 0 and upper[0] < REFERENCE * 0.01
+    assert lower[1] < REFERENCE * 0.1 / 0.9 < upper[1] < np.inf
+    assert lower[2] > 4 * REFERENCE and upper[2] == np.inf
+
+
+def test_stiffness_and_its_bounded_form_are_inverse():
+    belief, b = chain(4, coupling=0.0), jnp.array([0.0, 0.3, 30.0, np.inf])
+    np.testing.assert_allclose(belief.bounded(b), [0, 0.3 / 30.3, 0.5, 1])
+    np.testing.assert_allclose(belief.stiffness(belief.bounded(b)), b)

@@ -1,0 +1,33 @@
+"""The benchmark: what it prints, and when its gate closes."""
+
+import json
+
+from jiggle_mj.eval import benchmark as bench
+
+
+def test_a_small_benchmark_has_its_figures_and_finds_the_disc():
+    metrics = bench.benchmark((150,), explicit=False, say=lambda _: None)
+    assert {"device", "equilibrium_n150_s", "update_n150_s", "update_n150_compile_s", "found_share"} <= set(metrics)
+    assert float(metrics["update_n150_s"]["value"]) > 0
+    assert float(metrics["found_share"]["value"]) > 0.8
+    json.dumps(metrics, allow_nan=False)
+
+
+def test_the_gate_closes_on_a_slower_time_and_on_a_share_that_falls():
+    then: bench.Metrics = {
+        "update_n600_s": {"value": 0.1, "unit": "s"},
+        "update_n600_compile_s": {"value": 1.0, "unit": "s"},
+        "found_share": {"value": 0.95, "unit": "share"},
+    }
+    same = {name: dict(entry) for name, entry in then.items()}
+    assert bench.regressions(same, then) == []
+    same["update_n600_compile_s"]["value"] = 100.0
+    assert bench.regressions(same, then) == []
+    same["update_n600_s"]["value"], same["found_share"]["value"] = 0.31, 0.92
+    assert [line.split()[0] for line in bench.regressions(same, then)] == ["update_n600_s", "found_share"]
+
+
+def test_the_committed_baseline_can_be_compared():
+    committed = bench.baseline()
+    assert "update_n600_s" in committed and "found_share" in committed
+    assert bench.regressions(committed, committed) == []

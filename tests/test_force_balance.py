@@ -1,0 +1,79 @@
+"""What a frame says of the attachments: the dense formula, from free to welded, and particles that were not seen."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.force_balance import FAINT, ForceBalance
+from small_sheet import DECLARATION, attached, dense, lifts, sheet, sheet_balance, sheet_energy
+from small_sheet import observed as evidence
+
+K = DECLARATION.membrane_stiffness
+FORCE_SD, ANCHOR_SD = 1e-4, 1e-4
+N = sheet().n
+
+
+@eqx.filter_jit
+def information(balance: ForceBalance, x, s, evidence: Evidence):
+    return balance.information(balance.linearise(x, s, evidence))
+
+
+@pytest.fixture
+def balance() -> ForceBalance:
+    return sheet_balance(FORCE_SD)
+
+
+def test_information_equals_the_dense_formula(balance):
+    """D^T N^-1 D, -D^T N^-1 e and e^T N^-1 e over particles that are not held, with N = V + H R H^T written out."""
+    frame = lifts()[3]
+    seen, x = evidence(frame, 1), frame.x
+    s = np.random.default_rng(0).uniform(0, 1, N)
+    s[:5] = 1
+    found = information(balance, jnp.asarray(x), jnp.asarray(s), seen)
+
+    free, each = np.repeat(~frame.held, 3), np.repeat(s, 3)
+    internal = np.asarray(sheet_energy().internal_gradient(jnp.asarray(x)))
+    stiff = dense(sheet_energy().layout, sheet_energy().hessian(jnp.asarray(x), jnp.zeros(N)))
+    d = x - sheet().rest
+    H = (1 - each)[:, None] * stiff + np.diag(each * K)
+    R = np.zeros((3 * N, 3 * N))
+    D = np.zeros((3 * N, N))
+    for i in range(N):
+        R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = np.linalg.inv(np.asarray(seen.precision)[i] + FAINT * np.eye(3))
+        D[3 * i : 3 * i + 3, i] = K * d[i] - internal[i]
+    V = np.diag(((1 - each) * FORCE_SD) ** 2 + (each * K * ANCHOR_SD) ** 2)
+    e = ((1 - each) * internal.ravel() + each * K * d.ravel() + H @ (np.asarray(seen.y) - x).ravel())[free]
+    D, N_inverse = D[free], np.linalg.inv((V + H @ R @ H.T)[np.ix_(free, free)])
+    expected = D.T @ N_inverse @ D
+    np.testing.assert_allclose(found.precision, expected, atol=1e-7 * np.abs(expected).max())
+    pulled = -D.T @ N_inverse @ e
+    np.testing.assert_allclose(found.pulled, pulled, atol=1e-6 * np.abs(pulled).max())
+    np.testing.assert_allclose(found.squared, e @ N_inverse @ e, rtol=1e-6)
+    np.testing.assert_allclose(found.shift, pulled + expected @ s, atol=1e-6 * np.abs(expected @ s).max())
+
+
+def test_the_slope_is_the_derivative_of_the_balance(balance):
+    frame = lifts()[3]
+    seen, x = evidence(frame, 1), jnp.asarray(frame.x)
+    s, step = jnp.asarray(np.random.default_rng(1).uniform(0, 1, N)), 1e-6
+    ahead, behind, here = (balance.linearise(x, s + move, seen) for move in (step, -step, 0.0))
+    difference = (ahead.unbalanced - behind.unbalanced) / (2 * step)
+    np.testing.assert_allclose(here.slope, difference, atol=1e-8)
+
+
+def test_at_a_weld_the_reaction_force_shows(balance):
+    """A welded particle at the rim does not move; one frame gives its s a standard deviation of 0.4 all the same."""
+    frame, s = lifts(np.inf)[3], jnp.asarray(attached().astype(float))
+    moved = np.linalg.norm(frame.x - sheet().rest, axis=1)
+    assert moved[attached()].max() < 1e-5
+    found = information(balance, jnp.asarray(frame.x), s, evidence(frame, 2))
+    assert np.diagonal(found.precision)[attached()].max() > 1 / 0.4**2
+
+
+def test_evidence_only_sharpens(balance):
+    """Each frame's information is positive semi-definite."""
+    frame = lifts()[3]
+    found = information(balance, jnp.asarray(frame.x), jnp.zeros(N), evidence(frame, 3))
+    values = np.linalg.eigvalsh(np.asarray(found.precision))
+    assert values.min() > -1e-9 * values.max() and values.max() > 1e3

@@ -1,0 +1,53 @@
+"""Free or attached: odds, moments and quantiles against numerical integration."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
+from scipy.stats import norm
+
+SPIKE, SLAB = 3e-3, (0.01, 0.1, 1.0)
+LOG_ODDS = -3.0
+
+
+def density(mean: float, variance: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """A grid, the posterior on it, and the log Bayes factor."""
+    s = np.unique(np.concatenate([np.linspace(0, 1, 100_001), np.linspace(0, 0.03, 100_001)]))
+    seen = np.exp(norm.logpdf(s, mean, np.sqrt(variance)) - norm.logpdf(np.clip(mean, 0, 1), mean, np.sqrt(variance)))
+
+    def half_normal(width: float) -> np.ndarray:
+        shape = np.exp(-0.5 * (s / width) ** 2)
+        return shape / np.trapezoid(shape, s)
+
+    free, attached = half_normal(SPIKE) * seen, np.mean([half_normal(width) for width in SLAB], axis=0) * seen
+    odds = np.trapezoid(attached, s) / np.trapezoid(free, s)
+    whole = free + np.exp(LOG_ODDS) * attached
+    return s, whole / np.trapezoid(whole, s), float(np.log(odds))
+
+
+@pytest.mark.parametrize(
+    ("mean", "variance"),
+    [(0.02, 1e-4), (-0.05, 1e-4), (0.005, 1e-6), (0.5, 1e4), (0.9, 1e-2), (1.3, 1e-2), (0.0, 1e-6)],
+)
+def test_posterior_equals_numerical_integration(mean, variance):
+    prior = SpikeAndSlab.build(spike=SPIKE, slab=SLAB)
+    mixture, factor = prior.posterior(jnp.array([mean]), jnp.array([variance]), jnp.array([LOG_ODDS]))
+    s, p, expected_factor = density(mean, variance)
+    below = np.concatenate([[0], np.cumsum((p[1:] + p[:-1]) / 2 * np.diff(s))])
+    expected = np.trapezoid(p * s, s)
+    found, spread = (float(part[0]) for part in mixture.moments())
+    assert float(factor[0]) == pytest.approx(expected_factor, abs=1e-4)
+    assert float(mixture.attached[0]) == pytest.approx(1 / (1 + np.exp(-LOG_ODDS - expected_factor)), abs=1e-4)
+    assert found == pytest.approx(expected, rel=1e-4)
+    assert np.sqrt(spread) == pytest.approx(np.sqrt(np.trapezoid(p * (s - expected) ** 2, s)), rel=1e-3)
+    for level in (0.05, 0.5, 0.95):
+        assert float(mixture.quantile(level)[0]) == pytest.approx(np.interp(level, below, s), rel=1e-2, abs=1e-5)
+
+
+def test_far_out_in_the_tails_nothing_overflows():
+    mean, variance = jnp.array([-5.0, 0.3, 9.0]), jnp.array([1e-6, 1e-12, 1e-6])
+    mixture, factor = SpikeAndSlab.build(spike=SPIKE, slab=SLAB).posterior(mean, variance, jnp.full(3, LOG_ODDS))
+    found, spread = mixture.moments()
+    assert np.isfinite(factor).all() and np.isfinite(spread).all()
+    np.testing.assert_allclose(found, [0, 0.3, 1], atol=1e-4)
+    np.testing.assert_allclose(mixture.quantile(0.5), [0, 0.3, 1], atol=1e-4)
