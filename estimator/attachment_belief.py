@@ -7,8 +7,9 @@ its neighbours are: an Ising prior over the mesh [Besag 1986, doi:10.1111/j.2517
     p(attached) ~ exp(h sum_i a_i + J sum_ij a_i a_j)    a_i in {0, 1}, ij the mesh's edges.
 
 Expectation propagation [Minka 2001, arXiv:1301.2294] replaces each particle's prior by a Gaussian, its site, and belief
-propagation passes the odds between neighbours. Sites and messages are kept from frame to frame, so a few sweeps a frame
-are enough. float64 throughout: a float32 covariance of 600 stiffnesses loses definiteness.
+propagation passes the odds between neighbours. How stiff attachments of this tissue are is learned on the way
+(`SpikeAndSlab.learned`). All of it is kept from frame to frame, so that a few sweeps a frame are enough. float64
+throughout: a float32 covariance of 600 stiffnesses loses definiteness.
 """
 
 import equinox as eqx
@@ -92,7 +93,7 @@ class AttachmentBelief(eqx.Module):
             message=jnp.zeros(prior.neighbours.shape),
         )
         nothing = jnp.zeros(n), jnp.full(n, UNKNOWN)
-        return jax.lax.fori_loop(0, 20, lambda _, belief: belief._matched(*nothing, DAMPING), empty)
+        return jax.lax.fori_loop(0, 20, lambda _, belief: belief._matched(*nothing), empty)
 
     def bounded(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         """S of a stiffness [N/m]; 1 for infinity."""
@@ -115,7 +116,7 @@ class AttachmentBelief(eqx.Module):
 
     def sweep(self, gaussian: "Gaussian") -> "AttachmentBelief":
         """One of them, given what `gaussian` returned."""
-        return self._matched(*self._cavity(gaussian), DAMPING)
+        return self._matched(*self._cavity(gaussian))
 
     def posterior(self) -> "Posterior":
         """What is believed of each particle; call `refine` before."""
@@ -166,8 +167,8 @@ class AttachmentBelief(eqx.Module):
         mixture, factor = self.prior.stiffness.posterior(mean, variance, odds)
         return mixture, (odds + factor)[:, None] - self.message
 
-    def _matched(self, mean: Float[Array, " n"], variance: Float[Array, " n"], damping: float) -> "AttachmentBelief":
-        """Sites that give each particle the moments of its own distribution; messages passed once."""
+    def _matched(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> "AttachmentBelief":
+        """Sites that give each particle its own distribution's moments; messages passed and shares learned, once."""
         mixture, told = self._mixture(mean, variance)
         own_mean, own_variance = mixture.moments()
         precision = jnp.clip(1 / own_variance - 1 / variance, *SITE_PRECISION)
@@ -175,14 +176,18 @@ class AttachmentBelief(eqx.Module):
         sent = jnp.log1p(jax.nn.sigmoid(told) * jnp.expm1(self.prior.coupling))
         sent = jnp.concatenate([sent, jnp.zeros((1, sent.shape[1]), sent.dtype)])
         message = sent[self.prior.neighbours, self.prior.back]
-        kept = 1 - damping
+
+        def damped(old: Array, new: Array) -> Array:
+            return (1 - DAMPING) * old + DAMPING * new
+
         return eqx.tree_at(
-            lambda belief: (belief.site_precision, belief.site_shift, belief.message),
+            lambda belief: (belief.site_precision, belief.site_shift, belief.message, belief.prior.stiffness),
             self,
             (
-                kept * self.site_precision + damping * precision,
-                kept * self.site_shift + damping * shift,
-                kept * self.message + damping * message,
+                damped(self.site_precision, precision),
+                damped(self.site_shift, shift),
+                damped(self.message, message),
+                self.prior.stiffness.learned(mixture),
             ),
         )
 

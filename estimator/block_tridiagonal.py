@@ -194,6 +194,33 @@ def lower_square(factor: BlockCholesky, rhs: Float[Array, "blocks m n"]) -> Floa
     return square
 
 
+def inverse_band(factor: BlockCholesky) -> BlockTridiagonal:
+    """The blocks of A^-1 that lie where A has blocks, from the last to the first [Takahashi et al. 1973]."""
+
+    def step(following, blocks):
+        inverse, lower = blocks
+        coupling = lower @ inverse
+        beside = -following @ coupling
+        diagonal = inverse.T @ inverse - coupling.T @ beside
+        return diagonal, (diagonal, beside)
+
+    lower = jnp.concatenate([factor.lower, jnp.zeros_like(factor.inverse[:1])])
+    _, (diagonal, beside) = jax.lax.scan(step, jnp.zeros_like(factor.inverse[0]), (factor.inverse, lower), reverse=True)
+    return BlockTridiagonal(diagonal=diagonal, lower=beside[:-1])
+
+
+def window_sums(
+    layout: Layout, matrix: BlockTridiagonal, index: Int[Array, "m p p"], rows: Float[Array, "m p 3 3"]
+) -> Float[Array, " m"]:
+    """Trace of B A B^T for each element's B, given as one 3x3 window a vertex; `index` is its `Layout.pair_index`."""
+    nb, w = layout.n_blocks, layout.width
+    lower = jnp.concatenate([matrix.lower, jnp.zeros_like(matrix.diagonal[:1])])[:nb]
+    blocks = jnp.stack([matrix.diagonal, lower]).reshape(2, nb, w, 3, w, 3).swapaxes(3, 4).reshape(-1, 3, 3)
+    windows = jnp.concatenate([blocks, jnp.zeros((1, 3, 3), blocks.dtype)])[index]
+    twice = jnp.where((index >= nb * w * w)[..., None, None], 2.0, 1.0)
+    return jnp.einsum("mjab,mjkbc,mkac->m", rows, twice * windows, rows)
+
+
 def solve_upper(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float[Array, "blocks m k"]:
     """L^T z = rhs."""
 

@@ -16,7 +16,7 @@ from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.filters.adam import AdamShooting
-from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
+from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull, Stated
 from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
@@ -209,10 +209,11 @@ class Estimator:
 
         Happens by itself when the jaws open or a new grasp begins; needed only where observations end with closed jaws.
         """
-        if isinstance(self._filter, ImplicitFilter) and isinstance(self._belief, AttachmentBelief):
-            with jax.enable_x64(True), one_thread():
-                self._belief, posterior = self._filter.release(self._belief)
-                self._b, self._probability = np.asarray(posterior.stiffness), np.asarray(posterior.attached)
+        if self._filter is None:
+            return
+        with jax.enable_x64(True), one_thread():
+            if (again := self._filter.release(self._belief)) is not None:
+                self._believe(again)
 
     def _update(self, observation: Observation) -> Estimate | None:
         tool = observation.tool
@@ -222,13 +223,11 @@ class Estimator:
                 return None
             self._filter = self._begin()
         if not tool.closed:
-            if self._hold is not None:
-                self.release()
+            self.release()
             self._hold = self._closing = None
             return None
         if self._closing is None or self._closing.grasp != tool.grasp:
-            if self._hold is not None:
-                self.release()
+            self.release()
             self._closing = tool
         began = time.perf_counter()
         track = self._see(observation)
@@ -243,9 +242,8 @@ class Estimator:
             raise PerceptionError(
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
             )
-        self._hold, self._belief = hold, update.belief
-        self._x, self._b = np.asarray(update.x), np.asarray(update.b)
-        self._probability = np.asarray(update.probability)
+        self._hold, self._x = hold, np.asarray(update.x)
+        self._believe(update)
         return Estimate(
             index=observation.index,
             time=observation.time,
@@ -261,6 +259,9 @@ class Estimator:
             update_s=time.perf_counter() - seen,
             perception_s=seen - began,
         )
+
+    def _believe(self, stated: Stated) -> None:
+        self._belief, self._b, self._probability = stated.belief, np.asarray(stated.b), np.asarray(stated.probability)
 
     def _check_begun(self) -> None:
         if self._filter is None:
@@ -293,31 +294,28 @@ class Estimator:
         """Build the model once the rest shape is known."""
         if self._sheet is None:
             self._sheet = self._points.start(self._still)
-        mesh, k = SheetMesh(self._sheet.rest, self._sheet.faces), self.declaration.membrane_stiffness
+        mesh = SheetMesh(self._sheet.rest, self._sheet.faces)
         self._field = MeshField(SheetPlane.through(mesh.rest).flatten(mesh.rest), mesh.faces)
-        found = self._build(mesh)
-        prior_mean = PRIOR_MEAN if self.config.filter == "explicit" else 0.0
-        self._belief: BoundaryBelief | AttachmentBelief = (
-            found.prior
-            if isinstance(found, ImplicitFilter)
-            else BoundaryBelief.prior(mesh.n, mean=prior_mean, sd=self.config.prior_sd * k)
-        )
+        found, self._belief = self._build(mesh)
         self.prior_entropy = float(self._belief.entropy())
         self._x, self._b, self._probability = mesh.rest, np.zeros(mesh.n), np.full(mesh.n, np.nan)
         return found
 
-    def _build(self, mesh: SheetMesh) -> Filter:
-        """The filter that the settings name."""
+    def _build(self, mesh: SheetMesh) -> tuple[Filter, BoundaryBelief | AttachmentBelief]:
+        """The filter that the settings name, and what it believes beforehand."""
         config, k = self.config, self.declaration.membrane_stiffness
         grip_stiffness, force_sd = config.grip_stiffness * k, config.force_sd * k * mesh.spacing
+        mean = PRIOR_MEAN if config.filter == "explicit" else 0.0
+        gaussian = BoundaryBelief.prior(mesh.n, mean=mean, sd=config.prior_sd * k)
         if config.filter in ("explicit", "adam"):
             shooting = MultipleShooting if config.filter == "explicit" else AdamShooting
-            return shooting(mesh, self.declaration, grip_stiffness=grip_stiffness, samples=config.samples)
+            return shooting(mesh, self.declaration, grip_stiffness=grip_stiffness, samples=config.samples), gaussian
         energy = surrogate(mesh, self.declaration, membrane=config.membrane)
         if config.filter == "nnls":
-            return NonNegativeLeastSquares.build(energy, force_sd=force_sd)
+            return NonNegativeLeastSquares.build(energy, force_sd=force_sd), gaussian
         if config.filter == "unscented":
-            return ReducedUnscented(mesh, energy, grip_stiffness=grip_stiffness, force_tolerance=force_sd / 4)
+            tolerance = force_sd / 4
+            return ReducedUnscented(mesh, energy, grip_stiffness=grip_stiffness, force_tolerance=tolerance), gaussian
         reference = config.reference * k
         balance = ForceBalance.build(
             mesh,
@@ -327,7 +325,7 @@ class Estimator:
             anchor_sd=config.anchor_sd,
             grip_stiffness=grip_stiffness,
         )
-        return ImplicitFilter(balance, prior_belief(mesh, reference=reference))
+        return ImplicitFilter(balance), prior_belief(mesh, reference=reference)
 
     def _see(self, observation: Observation) -> Track:
         if observation.images is not None and self._stereo is not None:

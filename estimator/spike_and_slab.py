@@ -1,14 +1,15 @@
 """One particle's bounded stiffness s in [0, 1]: free or attached a priori, and what a Gaussian measurement leaves.
 
 The prior is a spike and a slab [Mitchell & Beauchamp 1988, doi:10.1080/01621459.1988.10478694]: free is a half-normal
-too narrow to matter, attached an even mixture of half-normals of several widths, all cut off at 1. Times a Gaussian
-each part is a truncated normal, so that odds, moments and quantiles are closed forms.
+too narrow to matter, attached a mixture of normals from soft to rigid, the rungs of a ladder, all cut off to [0, 1].
+Times a Gaussian each part is a truncated normal, so that odds, moments and quantiles are closed forms. How often each
+rung occurs is learned from the particles that are called attached: attachments of one tissue resemble each other.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import log_ndtr, logsumexp, ndtr
+from jax.scipy.special import log_ndtr, logsumexp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
@@ -59,15 +60,34 @@ class Mixture(eqx.Module):
 class SpikeAndSlab(eqx.Module):
     """The prior."""
 
-    spike: Float[Array, ""]
-    """Standard deviation of s where free."""
-    slab: Float[Array, " _c"]
-    """Widths of the half-normals where attached."""
+    mean: Float[Array, " c"]
+    """Of each normal before it is cut off; 0 for the spike, the first."""
+    sd: Float[Array, " c"]
+    share: Float[Array, " _rungs"]
+    """Of each rung among attached particles."""
+    even: Float[Array, ""]
+    """How many attached particles the even shares are worth, from which learning starts."""
 
     @classmethod
-    def build(cls, *, spike: float, slab: tuple[float, ...]) -> "SpikeAndSlab":
-        """From the widths, all above 0."""
-        return cls(spike=jnp.asarray(spike, dtype=float), slab=jnp.asarray(slab, dtype=float))
+    def build(cls, *, spike: float, rungs: tuple[float, ...], spread: float, even: float) -> "SpikeAndSlab":
+        """For a spike of width `spike` and rungs at the given s, each as wide as `spread` times its s."""
+        centre = jnp.asarray(rungs, dtype=float)
+        return cls(
+            mean=jnp.concatenate([jnp.zeros(1), centre]),
+            sd=jnp.concatenate([jnp.full(1, spike), spread * centre]),
+            share=jnp.full(len(rungs), 1 / len(rungs)),
+            even=jnp.asarray(even, dtype=float),
+        )
+
+    def learned(self, mixture: "Mixture") -> "SpikeAndSlab":
+        """Shares as expected after counting the particles likelier attached than not, from a Dirichlet prior.
+
+        A step of expectation maximisation; doubtful particles are left out, since hundreds of them, each a little
+        likely to be attached faintly, would talk each other into it.
+        """
+        count = jnp.sum(jnp.where(mixture.attached > 0.5, mixture.weight[1:], 0.0), axis=1)
+        share = (self.even / len(count) + count) / (self.even + jnp.sum(count))
+        return eqx.tree_at(lambda prior: prior.share, self, share)
 
     def posterior(
         self, mean: Float[Array, " n"], variance: Float[Array, " n"], log_odds: Float[Array, " n"]
@@ -79,18 +99,22 @@ class SpikeAndSlab(eqx.Module):
             variance: of the measurements.
             log_odds: of 'attached' beforehand.
         """
-        width = jnp.concatenate([self.spike[None], self.slab])[:, None] ** 2
+        centre, width = self.mean[:, None], self.sd[:, None] ** 2
         mean, variance = mean[None], variance[None]
         narrowed = 1 / (1 / variance + 1 / width)
-        parts = Mixture(weight=narrowed, mean=narrowed * mean / variance, sd=jnp.sqrt(narrowed))
-        seen = norm.logpdf(mean, 0, jnp.sqrt(variance + width))
-        mass = _log_mass(-parts.mean / parts.sd, (1 - parts.mean) / parts.sd)
-        evidence = seen + mass - jnp.log(ndtr(1 / jnp.sqrt(width)) - 0.5)
-        of_slab = logsumexp(evidence[1:], axis=0) - jnp.log(jnp.asarray(len(self.slab), dtype=mean.dtype))
-        factor = of_slab - evidence[0]
+        parts = Mixture(weight=narrowed, mean=narrowed * (mean / variance + centre / width), sd=jnp.sqrt(narrowed))
+        seen = norm.logpdf(mean, centre, jnp.sqrt(variance + width))
+        evidence = seen + _cut_off(parts.mean, parts.sd) - _cut_off(centre, self.sd[:, None])
+        rungs = evidence[1:] + jnp.log(self.share)[:, None]
+        factor = logsumexp(rungs, axis=0) - evidence[0]
         attached = jax.nn.sigmoid(log_odds + factor)[None]
-        weight = jnp.concatenate([1 - attached, attached * jax.nn.softmax(evidence[1:], axis=0)])
+        weight = jnp.concatenate([1 - attached, attached * jax.nn.softmax(rungs, axis=0)])
         return eqx.tree_at(lambda parts: parts.weight, parts, weight), factor
+
+
+def _cut_off(mean: Float[Array, "c n"], sd: Float[Array, "c n"]) -> Float[Array, "c n"]:
+    """Log of a normal's mass in [0, 1]."""
+    return _log_mass(-mean / sd, (1 - mean) / sd)
 
 
 def _log_mass(below: Float[Array, "c n"], above: Float[Array, "c n"]) -> Float[Array, "c n"]:

@@ -22,6 +22,9 @@ from trimesh.triangles import closest_point, points_to_barycentric
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.truth import Truth, TruthFrame
 
+OBSERVABLE = 2.4e-3
+"""Load from which an attachment can be told from the model's own error, four standard deviations of the force on a
+particle that the estimator's model gets wrong in the shipped scenes [N]."""
 PAIRS_AT_ONCE = 400_000
 """Point-triangle pairs handled together, which bounds the memory to some 100 MB."""
 
@@ -33,6 +36,13 @@ class CarriedTruth:
     attached: Bool[np.ndarray, " n"]
     stiffness: Float[np.ndarray, " n"]
     """b*, rescaled by area [N/m]; inf for a weld, NaN where attached by an unknown amount."""
+    load: Float[np.ndarray, " n"] | None = None
+    """Root of the sum over frames of the squared force that the attachment carried [N]; None where not recorded."""
+
+    @property
+    def observable(self) -> Bool[np.ndarray, " n"] | None:
+        """Attached particles that were loaded enough to show: at least `OBSERVABLE`; None where not recorded."""
+        return None if self.load is None else self.attached & (self.load >= OBSERVABLE)
 
 
 def vertex_areas(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " n"]:
@@ -60,18 +70,23 @@ def stiffness_at(truth: Truth, frame: TruthFrame | None) -> Float[np.ndarray, " 
 
 
 def carry(sheet: Sheet, truth: Truth, index: int) -> CarriedTruth:
-    """The truth at observation `index` on the particles of `sheet`.
+    """The truth at observation `index` on the particles of `sheet`, and the loads up to it.
 
-    A reference without triangles has no areas: its stiffness is taken over unscaled.
+    A reference without triangles has no areas: its stiffness and loads are taken over unscaled.
     """
     nearest = np.asarray(KDTree(truth.rest).query(sheet.rest)[1])
     stiffness = stiffness_at(truth, frame_at(truth, index))[nearest]
     attached = np.isnan(stiffness) | (stiffness > 0)
+    loads = [frame.load for frame in truth.frames if frame.load is not None and frame.index <= index]
+    load = np.sqrt(np.sum(np.square(loads), axis=0))[nearest] if loads else None
     if len(truth.faces):
         mine, reference = vertex_areas(sheet.rest, sheet.faces), vertex_areas(truth.rest, truth.faces)[nearest]
         scalable = attached & (reference > 0)
-        stiffness[scalable] *= mine[scalable] / reference[scalable]
-    return CarriedTruth(attached=attached, stiffness=stiffness)
+        larger = mine[scalable] / reference[scalable]
+        stiffness[scalable] *= larger
+        if load is not None:
+            load[scalable] *= larger
+    return CarriedTruth(attached=attached, stiffness=stiffness, load=load)
 
 
 def barycentric_weights(

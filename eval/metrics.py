@@ -79,6 +79,7 @@ def agreement(
     rings: int,
     *,
     certain: Bool[np.ndarray, " n"] | None = None,
+    knowable: Bool[np.ndarray, " n"] | None = None,
 ) -> Agreement:
     """PCD, PUG and F1 after `rings` rings of dilation.
 
@@ -91,9 +92,11 @@ def agreement(
         rings: steps of dilation.
         certain: particles that pass the variance gate; the others are dropped from D and from the T that PUG counts.
             The truth that a detection may hit is never thinned.
+        knowable: the part of T that PUG counts, all of it if None.
     """
     counted = np.ones_like(attached) if certain is None else certain
-    found, wanted = detected & counted, attached & counted
+    found = detected & counted
+    wanted = attached & counted if knowable is None else attached & counted & knowable
     pcd = _share(found & dilate(attached, faces, rings), found)
     pug = _share(wanted & dilate(found, faces, rings), wanted)
     if pcd is None and pug is None:

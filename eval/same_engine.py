@@ -95,7 +95,10 @@ def same_engine(
     for index, moment in enumerate(moments):
         seen = MeasuredPoints(positions=moment.x + noise * rng.normal(size=moment.x.shape), track_id=ids, sd=noise)
         observations.append(Observation(index=index, time=index, tool=moment.tool, points=seen))
-        frames.append(TruthFrame(index=index, time=index, positions=moment.x, stiffness=b, tip=moment.tool.position))
+        load = b * np.linalg.norm(moment.x - mesh.rest, axis=1)
+        frames.append(
+            TruthFrame(index=index, time=index, positions=moment.x, stiffness=b, tip=moment.tool.position, load=load)
+        )
     details = {"engine": engine, "stiffness": stiffness, "noise": noise, "seed": seed, "grasps": grasps}
     truth = Truth(
         rest=mesh.rest, faces=mesh.faces, attached=attached, frames=tuple(frames), scene=scene.name, details=details

@@ -3,9 +3,7 @@
 `result` makes the whole skeleton from what the estimator knows, with null for all that needs the truth; `with_truth`
 fills that in; `score` does it for a folder on disk. Fractions, not per cent; null where undefined.
 
-Not judged yet, and null: which attachments the pulls could show (`n_observable`, `observable`), the limit on the
-boundary energy and its violations, the time of planning, and the expected calibration error, since no rule states
-probabilities.
+Not judged yet, and null: the limit on the boundary energy and its violations, and the time of planning.
 """
 
 import copy
@@ -14,8 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 from jiggle_mj.eval.calibration import calibration
-from jiggle_mj.eval.carrying import carry
+from jiggle_mj.eval.carrying import CarriedTruth, carry
 from jiggle_mj.eval.metrics import DILATIONS, agreement, average_precision
 from jiggle_mj.eval.tracking import mean_boundary_energy, tracking
 
@@ -112,16 +111,21 @@ def with_truth(
 ) -> Json:
     """A copy of `unscored` with all that the truth decides; the truth is that at the last frame the estimator used."""
     carried = carry(sheet, truth, estimates[-1].index if estimates else 0)
-    agreements = {rings: agreement(detection.attached, carried.attached, sheet.faces, rings) for rings in DILATIONS}
     probability = detection.score if detection.probabilistic else None
     judged = calibration(belief, carried.stiffness, carried.attached, probability=probability)
     scored = copy.deepcopy(unscored)
     _section(scored, "detection").update(
         n_detected=int(detection.attached.sum()),
         n_attached=int(carried.attached.sum()),
-        by_dilation={str(rings): {"pcd": one.pcd, "pug": one.pug, "f1": one.f1} for rings, one in agreements.items()},
+        by_dilation=_agreements(sheet, detection, carried),
         average_precision=average_precision(detection.score, carried.attached),
     )
+    observable = carried.observable
+    if observable is not None:
+        _section(scored, "detection").update(
+            n_observable=int(observable.sum()),
+            observable={"by_dilation": _agreements(sheet, detection, carried, knowable=observable)},
+        )
     _section(scored, "calibration").update(
         nees_per_dof=judged.nees_per_dof, coverage_90=judged.coverage_90, ece=judged.ece
     )
@@ -207,6 +211,17 @@ def read_result(path: Path) -> Json:
     if not isinstance(figures, dict) or not isinstance(figures.get("detection"), dict):
         raise OutputError(f"{path} is JSON but not a result of this program; give the folder that 'estimate' wrote.")
     return figures
+
+
+def _agreements(
+    sheet: Sheet, detection: Detection, carried: CarriedTruth, *, knowable: Bool[np.ndarray, " n"] | None = None
+) -> Json:
+    """PCD, PUG and F1 by rings of dilation."""
+    by_dilation: Json = {}
+    for rings in DILATIONS:
+        one = agreement(detection.attached, carried.attached, sheet.faces, rings, knowable=knowable)
+        by_dilation[str(rings)] = {"pcd": one.pcd, "pug": one.pug, "f1": one.f1}
+    return by_dilation
 
 
 def _section(figures: Json, name: str) -> Json:

@@ -23,6 +23,8 @@ class TruthFrame:
     """True attachment stiffness of each vertex [N/m]; inf for a weld, NaN where only its presence is known."""
     tip: Float[np.ndarray, " 3"]
     """True tip position [m]."""
+    load: Float[np.ndarray, " n"] | None = None
+    """Force that each vertex's attachment carries [N], 0 where free; None where unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)

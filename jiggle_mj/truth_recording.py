@@ -79,7 +79,10 @@ class TruthWriter:
         """Write one frame, and hand it to the operating system."""
         output, time = self._output, frame.time
         columns = dict(zip("xyz", np.asarray(frame.positions, float).T, strict=True))
-        output.message(POINTS, time, point_cloud(time, columns | {"stiffness": np.asarray(frame.stiffness, float)}))
+        columns["stiffness"] = np.asarray(frame.stiffness, float)
+        if frame.load is not None:
+            columns["load"] = np.asarray(frame.load, float)
+        output.message(POINTS, time, point_cloud(time, columns))
         tool = PoseInFrame(timestamp=timestamp(time), frame_id=WORLD)
         fill_pose(tool.pose, frame.tip)
         output.message(TOOL, time, tool)
@@ -159,6 +162,7 @@ def _parse_frame(points: Message, tool: Message, frame: Message) -> TruthFrame:
         positions=_positions(columns),
         stiffness=columns["stiffness"],
         tip=np.array([tip.x, tip.y, tip.z]),
+        load=columns.get("load"),
     )
 
 

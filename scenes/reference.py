@@ -69,6 +69,7 @@ class Reference:
         """Indices of observations taken before the tissue was at rest."""
         self._renderer = StereoRenderer(self._tissue.model, scene.camera) if sensing == "stereo" else None
         self._set_jaws(OPEN_ANGLE)
+        self._anchors = self._data.flexvert_xpos.copy()
         self._settle(speed=AT_REST)
         self._data.time = 0.0
         self._rest = self._surface()
@@ -236,7 +237,18 @@ class Reference:
             positions=self._surface(),
             stiffness=self._tissue.stiffness.copy(),
             tip=self._tip,
+            load=self._load(),
         )
+
+    def _load(self) -> Float[np.ndarray, " n"]:
+        """What each spring pulls with, and the constraint force of each weld [N]."""
+        data, stiffness = self._data, self._tissue.stiffness
+        stretched = np.linalg.norm(data.flexvert_xpos - self._anchors, axis=1)
+        load = np.where(np.isfinite(stiffness), stiffness, 0.0) * stretched
+        equality = np.where(data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY, data.efc_id, -1)
+        for vertex, weld in self._tissue.welds.items():
+            load[vertex] = np.linalg.norm(data.efc_force[equality == weld])
+        return load
 
     def _observe(self) -> Observation:
         settings = self.scene.sensing

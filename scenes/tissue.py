@@ -45,6 +45,8 @@ class TissueModel:
     """Joint ids; MuJoCo's qpos and dof addresses follow from them."""
     grips: Int[np.ndarray, " n"]
     """Equality ids of the grasp."""
+    welds: dict[int, int]
+    """Equality id of each welded vertex."""
     jaws: tuple[int, int]
     """Joint ids of the tweezer."""
 
@@ -84,6 +86,7 @@ def build_tissue(scene: Scene, *, drawn: bool = True) -> TissueModel:
         stiffness=stiffness,
         joints=model.body_jntadr[bodies][:, None] + np.arange(3),
         grips=np.array([model.equality(f"grip{i}").id for i in range(len(stiffness))]),
+        welds={int(i): model.equality(f"weld{i}").id for i in np.flatnonzero(np.isinf(stiffness))},
         jaws=(model.joint("tweezer/left_jaw").id, model.joint("tweezer/right_jaw").id),
     )
     return compiled

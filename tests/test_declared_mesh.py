@@ -70,18 +70,21 @@ def folder(tmp_path_factory):
     return where
 
 
-@pytest.mark.xfail(
-    reason="two reports, 2 mm outside the hold: the prior of few, lone attachments is too sure", strict=True
-)
-def test_the_hold_is_found_where_nothing_is_seen(folder, tmp_path):
-    """Half of the reports lie within the hold and none further right than three particles into the view."""
+def test_the_hold_is_suspected_where_nothing_is_seen_and_nowhere_else(folder, tmp_path):
+    """Five frames say that the strip is held beyond the view, not which particles hold it: P(attached) is spread there.
+
+    None further right than three particles into the view is reported, and few are expected.
+    """
     summary = import_folder(folder, None, tmp_path / "strip.mcap")
     run_estimator(tmp_path / "strip.mcap", tmp_path / "out")
     found = read_estimate(tmp_path / "out" / "estimate.mcap")
-    assert found.sheet.rest[:, 0].min() < LEFT + 2e-3 and summary.n_held > 0
-    assert not np.isfinite(found.estimates[-1].observed[found.sheet.rest[:, 0] < VIEW - 1e-3]).any()
-    reported = found.sheet.rest[found.detection.attached, 0]
-    assert np.median(reported) < HOLD and reported.max() < VIEW + 3 * 4e-3
+    x, probability = found.sheet.rest[:, 0], found.detection.score
+    assert x.min() < LEFT + 2e-3 and summary.n_held > 0
+    assert not np.isfinite(found.estimates[-1].observed[x < VIEW - 1e-3]).any()
+    seen = (x > VIEW + 3 * 4e-3) & ~found.estimates[-1].held
+    assert not found.detection.attached[seen].any() and probability[seen].mean() < 0.03
+    assert probability[x < VIEW].mean() > 4 * probability[seen].mean()
+    assert probability[x < VIEW].sum() > 2.5
     assert summary.truth is not None and summary.n_attached
     score_directory(tmp_path / "out", summary.truth)
     figures = json.loads((tmp_path / "out" / "result.json").read_text())

@@ -173,6 +173,7 @@ def test_a_later_grasp_off_the_tissue_is_skipped_by_name_and_keeps_what_was_lear
     estimator = Estimator(DECLARATION)
     for one in episode()[:4]:
         estimator.update(one)
+    estimator.release()
     before = estimator.belief
     assert estimator.update(observe(4, sheet().rest, np.array([0.2, 0.0, 0.0]), 2)) is None
     ((index, why),) = estimator.skipped

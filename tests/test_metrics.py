@@ -175,6 +175,30 @@ def test_a_uniform_bed_of_springs_keeps_its_total_stiffness_on_any_mesh():
     assert carried.stiffness.sum() == pytest.approx(density * 0.12**2, rel=1e-12)
 
 
+def test_loads_add_up_in_squares_until_the_frame_and_scale_with_the_area():
+    """3 mN in one frame and 4 mN in the next are 5 mN, on the same mesh; later frames do not count."""
+    rest, faces = lattice(2, 0.01)
+    frames = tuple(
+        TruthFrame(index=k, time=k, positions=rest, stiffness=np.ones(4), tip=np.zeros(3), load=np.full(4, load))
+        for k, load in enumerate((3e-3, 4e-3, 1.0))
+    )
+    truth = Truth(rest=rest, faces=faces, attached=np.ones(4, bool), frames=frames, scene="", details={})
+    carried = carry(Sheet(rest=rest, faces=faces), truth, 1)
+    np.testing.assert_allclose(carried.load, 5e-3)
+    assert carried.observable is not None and carried.observable.all()
+    first = carry(Sheet(rest=rest, faces=faces[:1]), truth, 0)
+    np.testing.assert_allclose(first.load, 3e-3 * vertex_areas(rest, faces[:1]) / vertex_areas(rest, faces))
+    assert first.observable is not None and first.observable.tolist() == [True, False, False, False]
+    assert carry(Sheet(rest=rest, faces=faces), truth_of(rest, faces, np.ones(4)), 0).observable is None
+
+
+def test_only_the_knowable_part_of_the_truth_has_to_be_found():
+    """A report inside the rest is no mistake."""
+    attached, knowable, detected = (chosen(*ids) for ids in ((0, 1, 2), (0,), (0, 1, 5)))
+    one = agreement(detected, attached, STRIP, 0, knowable=knowable)
+    assert one.pcd == pytest.approx(2 / 3) and one.pug == 1
+
+
 def test_welds_unknown_amounts_and_cuts_are_carried_as_such():
     """A weld stays infinite, NaN stays attached, and a vertex cut since the start is free."""
     rest, faces = lattice(2, 0.01)

@@ -98,7 +98,7 @@ def test_the_readme_example_finds_the_attachments(tmp_path: Path):
     true = np.any([shape.distance(rest[:, :2]) <= shape.half_width for shape in shapes], axis=0)
     assert (reported & true).sum() >= RIGHT_AT_LEAST * max(reported.sum(), true.sum())
     assert f"{reported.sum()} of {len(rest)} particles attached" in done.stdout
-    assert len(re.findall(r"mm: b = \d", done.stdout)) == reported.sum()
+    assert len(re.findall(r"mm: P = \d", done.stdout)) == reported.sum()
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)

@@ -665,6 +665,7 @@ def truth() -> Truth:
             positions=generator.normal(size=(4, 3)),
             stiffness=np.array([0, np.inf, np.nan, 1 / 3]),
             tip=np.array([np.nan, index, 1 / 3]),
+            load=np.array([0, 1 / 3, np.nan, 2.0]) if index else None,
         )
         for index in (0, 2, 5)
     )

@@ -140,6 +140,29 @@ def test_a_weld_stays_where_it_is_while_a_corner_is_lifted():
     assert np.isinf(reference.truth_frame().stiffness[attached]).all()
 
 
+def lifted_load(stiffness: float) -> np.ndarray:
+    """What each attachment carries once a corner is 20 mm up [N]."""
+    reference = particles(dataclasses.replace(SCENE, attachments=(dataclasses.replace(MIDDLE, stiffness=stiffness),)))
+    reference.step(Grasp(point=CORNER, radius=8e-3))
+    reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.02])))
+    frame = reference.truth_frame()
+    assert frame.load is not None and (frame.load[~reference.truth().attached] == 0).all()
+    return frame.load[reference.truth().attached]
+
+
+def test_a_springs_load_is_its_stretch_and_a_welds_what_a_stiff_spring_would_carry():
+    """300 N/m stretch by 0.3 mm under the largest of these loads, about what the weld gives too."""
+    reference = particles()
+    reference.step(Grasp(point=CORNER, radius=8e-3))
+    reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.02])))
+    frame, joints = reference.truth_frame(), reference._tissue.qpos_address
+    stretched = np.linalg.norm(reference._data.qpos[joints], axis=1)
+    np.testing.assert_allclose(frame.load, frame.stiffness * stretched, atol=1e-12)
+    weld, spring = lifted_load(math.inf), lifted_load(300.0)
+    assert weld.max() == pytest.approx(spring.max(), rel=0.1)
+    assert weld.sum() == pytest.approx(spring.sum(), rel=0.1)
+
+
 def test_welded_vertices_slip_out_of_the_jaws_and_a_grasp_of_nothing_else_is_refused():
     weld = dataclasses.replace(MIDDLE, stiffness=math.inf)
     scene = dataclasses.replace(SCENE, attachments=(weld,))

@@ -6,8 +6,9 @@ import pytest
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 from scipy.stats import norm
 
-SPIKE, SLAB = 3e-3, (0.01, 0.1, 1.0)
+SPIKE, RUNGS, SPREAD = 3e-3, (0.01, 0.1, 1.0), 0.5
 LOG_ODDS = -3.0
+PRIOR = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=3.0)
 
 
 def density(mean: float, variance: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -15,11 +16,12 @@ def density(mean: float, variance: float) -> tuple[np.ndarray, np.ndarray, float
     s = np.unique(np.concatenate([np.linspace(0, 1, 100_001), np.linspace(0, 0.03, 100_001)]))
     seen = np.exp(norm.logpdf(s, mean, np.sqrt(variance)) - norm.logpdf(np.clip(mean, 0, 1), mean, np.sqrt(variance)))
 
-    def half_normal(width: float) -> np.ndarray:
-        shape = np.exp(-0.5 * (s / width) ** 2)
+    def cut_off(centre: float, width: float) -> np.ndarray:
+        shape = np.exp(-0.5 * ((s - centre) / width) ** 2)
         return shape / np.trapezoid(shape, s)
 
-    free, attached = half_normal(SPIKE) * seen, np.mean([half_normal(width) for width in SLAB], axis=0) * seen
+    free = cut_off(0, SPIKE) * seen
+    attached = np.mean([cut_off(rung, SPREAD * rung) for rung in RUNGS], axis=0) * seen
     odds = np.trapezoid(attached, s) / np.trapezoid(free, s)
     whole = free + np.exp(LOG_ODDS) * attached
     return s, whole / np.trapezoid(whole, s), float(np.log(odds))
@@ -30,8 +32,7 @@ def density(mean: float, variance: float) -> tuple[np.ndarray, np.ndarray, float
     [(0.02, 1e-4), (-0.05, 1e-4), (0.005, 1e-6), (0.5, 1e4), (0.9, 1e-2), (1.3, 1e-2), (0.0, 1e-6)],
 )
 def test_posterior_equals_numerical_integration(mean, variance):
-    prior = SpikeAndSlab.build(spike=SPIKE, slab=SLAB)
-    mixture, factor = prior.posterior(jnp.array([mean]), jnp.array([variance]), jnp.array([LOG_ODDS]))
+    mixture, factor = PRIOR.posterior(jnp.array([mean]), jnp.array([variance]), jnp.array([LOG_ODDS]))
     s, p, expected_factor = density(mean, variance)
     below = np.concatenate([[0], np.cumsum((p[1:] + p[:-1]) / 2 * np.diff(s))])
     expected = np.trapezoid(p * s, s)
@@ -46,8 +47,21 @@ def test_posterior_equals_numerical_integration(mean, variance):
 
 def test_far_out_in_the_tails_nothing_overflows():
     mean, variance = jnp.array([-5.0, 0.3, 9.0]), jnp.array([1e-6, 1e-12, 1e-6])
-    mixture, factor = SpikeAndSlab.build(spike=SPIKE, slab=SLAB).posterior(mean, variance, jnp.full(3, LOG_ODDS))
+    mixture, factor = PRIOR.posterior(mean, variance, jnp.full(3, LOG_ODDS))
     found, spread = mixture.moments()
     assert np.isfinite(factor).all() and np.isfinite(spread).all()
     np.testing.assert_allclose(found, [0, 0.3, 1], atol=1e-4)
     np.testing.assert_allclose(mixture.quantile(0.5), [0, 0.3, 1], atol=1e-4)
+
+
+def test_the_shares_are_those_of_the_particles_called_attached():
+    """Twenty on one rung, measured well; two free ones, and one of which nothing is known, count nothing."""
+    mean = jnp.array([0.1] * 20 + [0.0, 0.0, 0.5])
+    variance = jnp.array([1e-6] * 22 + [1e6])
+    mixture, _ = PRIOR.posterior(mean, variance, jnp.full(23, LOG_ODDS))
+    learned = PRIOR.learned(mixture)
+    on_it = np.asarray(mixture.weight[2, :20]).sum()
+    assert float(learned.share[1]) == pytest.approx((1 + on_it) / 23, rel=1e-6)
+    assert float(jnp.sum(learned.share)) == pytest.approx(1)
+    nobody, _ = PRIOR.posterior(jnp.zeros(4), jnp.full(4, 1e-6), jnp.full(4, LOG_ODDS))
+    np.testing.assert_allclose(PRIOR.learned(nobody).share, 1 / 3)

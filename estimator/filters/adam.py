@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.belief import BoundaryBelief
-from jiggle_mj.estimator.filters.evidence import Evidence, Update, not_stated
+from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
 from jiggle_mj.estimator.filters.shots import SWEEPS, History, Shots, predicted, simulator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.xpbd import XPBD
@@ -25,7 +25,7 @@ STEPS = 25
 """Of Adam, each frame."""
 
 
-class AdamShooting:
+class AdamShooting(Filter):
     """Gradient descent for one sheet, with the samples so far."""
 
     def __init__(self, mesh: SheetMesh, declaration: Declaration, *, grip_stiffness: float, samples: int) -> None:

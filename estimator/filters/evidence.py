@@ -1,6 +1,7 @@
 """What a frame gives to a filter, and what the filter gives back: one interface for all of them."""
 
-from typing import Any, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,13 +35,11 @@ class Evidence(eqx.Module):
     pull: Pull | None = None
 
 
-class Update(eqx.Module):
-    """The outcome of one frame; what a filter does not state (uncertainty, or P(attached)) is NaN."""
+class Stated(eqx.Module):
+    """What a filter believes; what it does not state (uncertainty, or P(attached)) is NaN."""
 
     belief: BoundaryBelief | AttachmentBelief
     """Of the kind that the filter was given."""
-    x: Float[Array, "n 3"]
-    """State after the update [m]."""
     b: Float[Array, " n"]
     """Non-negative mean [N/m]."""
     sd: Float[Array, " n"]
@@ -49,14 +48,21 @@ class Update(eqx.Module):
     """P(attached)."""
     entropy: Float[Array, ""]
     """Of the belief [nat]."""
+
+
+class Update(Stated):
+    """The outcome of one frame."""
+
+    x: Float[Array, "n 3"]
+    """State after the update [m]."""
     nis: Float[Array, ""]
     """Normalised innovation squared per degree of freedom, before the update; 1 where the stated noises are right."""
 
 
-@runtime_checkable
-class Filter(Protocol):
+class Filter(ABC):
     """A way to update the belief; it may keep frames of its own for later updates."""
 
+    @abstractmethod
     def update(self, belief: Any, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]) -> Update:
         """Take one frame into the belief.
 
@@ -66,7 +72,10 @@ class Filter(Protocol):
             evidence: what was seen.
             start: where a search for the state may begin [m].
         """
-        ...
+
+    def release(self, belief: Any) -> Stated | None:
+        """Say that the jaws have opened; None where that changes nothing."""
+        return None
 
 
 def not_stated(like: Float[Array, " n"]) -> Float[Array, " n"]:

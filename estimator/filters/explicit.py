@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
-from jiggle_mj.estimator.filters.evidence import Evidence, Update, not_stated
+from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
 from jiggle_mj.estimator.filters.shots import SWEEPS, History, Shots, predicted, simulator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.xpbd import XPBD
@@ -37,7 +37,7 @@ AT_ONCE = 100
 """Columns of the Jacobian that are computed together, which bounds the memory."""
 
 
-class MultipleShooting:
+class MultipleShooting(Filter):
     """The filter for one sheet, with the samples so far."""
 
     def __init__(self, mesh: SheetMesh, declaration: Declaration, *, grip_stiffness: float, samples: int) -> None:

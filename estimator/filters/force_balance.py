@@ -9,8 +9,8 @@ With s = b / (b + b_ref), f the gradient of the sheet's own energy and d = x - a
 
 which at s = 1 is a weld, x = a, and stays sensitive there: D = dr/ds = b_ref d - f holds the reaction force. With
 H = dr/dx, W = cov(n_f)^-1 (0 where loaded), A = R^-1 + H^T W H and N^-1 = W - W H A^-1 H^T W, eliminating x leaves for
-s the evidence D^T N^-1 D. Linear in s at the observed state, so the wild response of a free sheet is never needed.
-Needs correspondences.
+s the evidence D^T N^-1 D, with D as far as it is more than its own error (`_calibrated`). Linear in s at the observed
+state, so the wild response of a free sheet is never needed. Needs correspondences.
 """
 
 import equinox as eqx
@@ -25,8 +25,10 @@ from jiggle_mj.estimator.block_tridiagonal import (
     add_to_diagonal,
     assemble,
     cholesky,
+    inverse_band,
     lower_square,
     solve,
+    window_sums,
 )
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Tether
@@ -136,7 +138,10 @@ class ForceBalance(eqx.Module):
 
     def linearise(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> "Frame":
         """The balance of forces around x and s."""
-        rows, weight = self._rows(x, s), self._weight(s, evidence)
+        internal, weight = self._internal_rows(x), self._weight(s, evidence)
+        itself = (self.neighbours == jnp.arange(len(x))[:, None])[:, :, None, None]
+        itself = jnp.where(itself, jnp.eye(3, dtype=x.dtype), 0.0)
+        rows = (1 - s)[:, None, None, None] * internal + (s * self.reference)[:, None, None, None] * itself
         squares = jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows)
         matrix = assemble(self.layout, [(self.places, squares)])
         matrix = add_to_diagonal(self.layout, matrix, evidence.precision + FAINT * jnp.eye(3)[None])
@@ -145,6 +150,7 @@ class ForceBalance(eqx.Module):
             s=s,
             unbalanced=self._unbalanced(x, s),
             slope=self.reference * (x - self.energy.rest) - self.energy.internal_gradient(x),
+            turn=self.reference * itself - internal,
             rows=rows,
             weight=weight,
             factor=cholesky(matrix),
@@ -153,18 +159,29 @@ class ForceBalance(eqx.Module):
 
     def information(self, frame: "Frame") -> "Information":
         """What the frame says of s, with its state eliminated."""
-        layout, w = self.layout, frame.weight
+        layout, w, slope = self.layout, frame.weight, self._calibrated(frame)
         residual = frame.unbalanced + self._apply(frame.rows, frame.off)
         back = solve(layout, frame.factor, self._transposed(frame.rows, w[:, None] * residual))
         whitened = w[:, None] * (residual - self._apply(frame.rows, back))
-        spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, frame.slope)
+        spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, slope)
         padded = layout.n_blocks * layout.width
         slot = jnp.append(layout.slot, padded)[self.neighbours]
         V = jnp.zeros((padded + 1, 3, padded), spread.dtype).at[slot, :, layout.slot[:, None]].add(spread)[:-1]
         square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
-        precision = jnp.diag(w * jnp.sum(frame.slope**2, axis=1)) - square[layout.slot][:, layout.slot]
-        pulled = -jnp.sum(frame.slope * whitened, axis=1)
+        precision = jnp.diag(w * jnp.sum(slope**2, axis=1)) - square[layout.slot][:, layout.slot]
+        pulled = -jnp.sum(slope * whitened, axis=1)
         return Information(precision=precision, pulled=pulled, squared=jnp.sum(residual * whitened), at=frame.s)
+
+    def _calibrated(self, frame: "Frame") -> Float[Array, "n 3"]:
+        """D, shrunk towards 0 by the share of |D|^2 that its own error makes up.
+
+        D is taken at an estimate of x, whose covariance is A^-1. Where nothing moves D is all error, and as a regressor
+        would pull s wherever the error points; its expectation given what was estimated does not [regression
+        calibration: Carroll et al. 2006, doi:10.1201/9781420010138].
+        """
+        error = window_sums(self.layout, inverse_band(frame.factor), self.places, frame.turn)
+        squared = jnp.sum(frame.slope**2, axis=1)
+        return jnp.maximum(1 - error / jnp.maximum(squared, 1e-30), 0.0)[:, None] * frame.slope
 
     def _weight(self, s: Float[Array, " n"], evidence: Evidence) -> Float[Array, " n"]:
         variance = ((1 - s) * self.force_sd) ** 2 + (s * self.reference * self.anchor_sd) ** 2
@@ -190,17 +207,14 @@ class ForceBalance(eqx.Module):
         best = jnp.nanargmin(costs)
         return x + lengths[best] * move, costs[best]
 
-    def _rows(self, x: Float[Array, "n 3"], s: Float[Array, " n"]) -> Float[Array, "n p 3 3"]:
-        """H, the windows of each particle's row beside one another."""
+    def _internal_rows(self, x: Float[Array, "n 3"]) -> Float[Array, "n p 3 3"]:
+        """df/dx, the windows of each particle's row beside one another."""
         n, width = self.neighbours.shape
         rows = jnp.zeros((n * width, 3, 3), x.dtype)
         for term, slot in zip(self.energy.terms, self.slots, strict=True):
             windows = jnp.swapaxes(term.hessian(x[term.vertices]), 2, 3).reshape(-1, 3, 3)
             rows = rows.at[slot.reshape(-1)].add(windows)
-        itself = self.neighbours == jnp.arange(n)[:, None]
-        anchored = (s * self.reference)[:, None, None] * jnp.eye(3)[None]
-        boundary = jnp.where(itself[:, :, None, None], anchored[:, None], 0.0)
-        return (1 - s)[:, None, None, None] * rows.reshape(n, width, 3, 3) + boundary
+        return rows.reshape(n, width, 3, 3)
 
     def _transposed(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """H^T v."""
@@ -232,6 +246,8 @@ class Frame(eqx.Module):
     """r [N]."""
     slope: Float[Array, "n 3"]
     """D [N]."""
+    turn: Float[Array, "n p 3 3"]
+    """dD/dx [N/m]."""
     rows: Float[Array, "n p 3 3"]
     """H [N/m]."""
     weight: Float[Array, " n"]

@@ -12,16 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior, Posterior
-from jiggle_mj.estimator.filters.evidence import Evidence, Update
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior
+from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Stated, Update
 from jiggle_mj.estimator.filters.force_balance import ForceBalance, Information
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 
-SPIKE, SLAB = 3e-4, (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
-"""Widths of s where free, and where attached: from hardly felt to rigid."""
-PROBABILITY, COUPLING = 6.4e-3, 1.8
-"""Of being attached without attached neighbours, and what each adds to the log odds: 2.8 of them make it even."""
+SPIKE = 3e-4
+"""Width of s where free."""
+RUNGS, SPREAD, EVEN = tuple(0.003 * 10 ** (i / 4) for i in range(11)), 0.5, 3.0
+"""Of s where attached, from hardly felt to rigid; their relative widths; see `SpikeAndSlab.even`."""
+PROBABILITY, COUPLING = 0.04, 1.2
+"""Of being attached without attached neighbours, and what each adds to the log odds: 2.7 of them make it even."""
 SWEEPS, LAST_SWEEPS = 2, 20
 """Of the belief after a frame, and when the jaws open."""
 STALE = 0.1
@@ -30,12 +32,12 @@ PASSES = 3
 """Over stale grasps, at most, each time that the jaws open."""
 
 
-class ImplicitFilter:
+class ImplicitFilter(Filter):
     """The filter for one sheet, with the grasps so far."""
 
-    def __init__(self, balance: ForceBalance, prior: AttachmentBelief) -> None:
-        """Take the sheet's balance of forces, and what is believed before the first frame."""
-        self._balance, self.prior = balance, prior
+    def __init__(self, balance: ForceBalance) -> None:
+        """Take the sheet's balance of forces."""
+        self._balance = balance
         self._grasps: list[_Grasp] = []
         self._between = True
 
@@ -52,24 +54,27 @@ class ImplicitFilter:
             self._between = False
         return update
 
-    def release(self, belief: AttachmentBelief) -> tuple[AttachmentBelief, Posterior]:
+    def release(self, belief: AttachmentBelief) -> Stated | None:
         """The belief with all grasps linearised again that need it; the next frame begins another grasp."""
+        if self._between:
+            return None
         self._between = True
-        belief, said = _refined(belief)
+        stated = _refined(belief)
         for _ in range(PASSES):
-            stale = [grasp for grasp in self._grasps if grasp.distance(said.mean) > STALE]
+            s = belief.bounded(stated.b)
+            stale = [grasp for grasp in self._grasps if grasp.distance(s) > STALE]
             if not stale:
                 break
             for grasp in stale:
-                grasp.again(self._balance, said.mean)
+                grasp.again(self._balance, s)
             total = sum(grasp.precision for grasp in self._grasps), sum(grasp.shift for grasp in self._grasps)
-            belief, said = _refined(eqx.tree_at(lambda one: (one.precision, one.shift), belief, total))
-        return belief, said
+            stated = _refined(eqx.tree_at(lambda one: (one.precision, one.shift), stated.belief, total))
+        return stated
 
 
 def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
     """The prior of a sheet, with b_ref = reference [N/m]."""
-    stiffness = SpikeAndSlab.build(spike=SPIKE, slab=SLAB)
+    stiffness = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=EVEN)
     prior = AttachmentPrior.build(mesh.n, mesh.edges, stiffness=stiffness, probability=PROBABILITY, coupling=COUPLING)
     return AttachmentBelief.before(prior, reference=reference)
 
@@ -114,17 +119,8 @@ def _update(
     gaussian = belief.gaussian()
     nis = _normalised_innovation(found, gaussian.factor, evidence)
     belief = belief.sweep(gaussian).refine(SWEEPS - 1)
-    posterior = belief.posterior()
-    update = Update(
-        belief=belief,
-        x=balance.polish(frame, posterior.mean, evidence),
-        b=posterior.stiffness,
-        sd=posterior.stiffness_sd,
-        probability=posterior.attached,
-        entropy=posterior.entropy,
-        nis=nis,
-    )
-    return update, found
+    stated = _stated(belief)
+    return Update(**vars(stated), x=balance.polish(frame, belief.bounded(stated.b), evidence), nis=nis), found
 
 
 @eqx.filter_jit
@@ -136,9 +132,19 @@ def _information(
 
 
 @eqx.filter_jit
-def _refined(belief: AttachmentBelief) -> tuple[AttachmentBelief, Posterior]:
-    belief = belief.refine(LAST_SWEEPS)
-    return belief, belief.posterior()
+def _refined(belief: AttachmentBelief) -> Stated:
+    return _stated(belief.refine(LAST_SWEEPS))
+
+
+def _stated(belief: AttachmentBelief) -> Stated:
+    posterior = belief.posterior()
+    return Stated(
+        belief=belief,
+        b=posterior.stiffness,
+        sd=posterior.stiffness_sd,
+        probability=posterior.attached,
+        entropy=posterior.entropy,
+    )
 
 
 def _normalised_innovation(found: Information, factor: Float[Array, "n n"], evidence: Evidence) -> Float[Array, ""]:

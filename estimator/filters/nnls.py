@@ -18,10 +18,10 @@ from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviati
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Tether
 from jiggle_mj.estimator.equilibrium import equilibrium
-from jiggle_mj.estimator.filters.evidence import Evidence, Update, not_stated
+from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
 
 
-class NonNegativeLeastSquares(eqx.Module):
+class NonNegativeLeastSquares(eqx.Module, Filter):
     """The regression for one sheet; the frames so far are in the belief."""
 
     energy: SheetEnergy

@@ -24,7 +24,7 @@ from jiggle_mj.estimator.belief import BoundaryBelief, entropy, non_negative_min
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
-from jiggle_mj.estimator.filters.evidence import Evidence, Update, not_stated
+from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
 from jiggle_mj.estimator.mesh import SheetMesh
 from scipy.cluster.vq import kmeans2
 
@@ -34,7 +34,7 @@ STEPS = 40
 """Most Newton steps of an equilibrium."""
 
 
-class ReducedUnscented:
+class ReducedUnscented(Filter):
     """The filter for one sheet, with the reduced state so far."""
 
     def __init__(self, mesh: SheetMesh, energy: SheetEnergy, *, grip_stiffness: float, force_tolerance: float) -> None:
