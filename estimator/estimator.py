@@ -31,6 +31,7 @@ from jiggle_mj.estimator.surrogate import Membrane, surrogate
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.mesh_checks import check_unfolded
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
@@ -70,6 +71,13 @@ class EstimatorConfig:
         for name in POSITIVE:
             if not getattr(self, name) > 0:
                 raise ValueError(f"EstimatorConfig.{name} must be above 0; got {getattr(self, name)}.")
+        for name in SHARES:
+            share = getattr(self, name)
+            if not 1 / LARGEST_RATIO <= share <= LARGEST_RATIO:
+                raise ValueError(
+                    f"EstimatorConfig.{name} is a share of the membrane stiffness and must lie between "
+                    f"{1 / LARGEST_RATIO:g} and {LARGEST_RATIO:g}, what float32 can add to it; got {share}."
+                )
         if self.filter not in get_args(FilterName):
             raise ValueError(f"EstimatorConfig.filter must be one of {get_args(FilterName)}; got {self.filter!r}.")
         if not (isinstance(self.samples, int) and self.samples >= 1):
@@ -91,6 +99,9 @@ POSITIVE = (
     "detect_above",
 )
 """Settings that must be above 0."""
+
+SHARES, LARGEST_RATIO = ("reference", "prior_sd", "force_sd", "grip_stiffness", "detect_above"), 1e7
+"""Settings that are shares of the membrane stiffness, and how far from it they may be either way."""
 
 
 class Estimator:
@@ -192,6 +203,7 @@ class Estimator:
         Raises:
             PerceptionError: the sheet cannot be found in the first frames, or the first grasp is off the tissue. Once
                 there is an estimate, a frame that cannot be used goes to `skipped` instead.
+            MeshError: the sheet at rest is folded, or not one sheet.
         """
         with jax.enable_x64(True), one_thread():
             try:
@@ -258,6 +270,7 @@ class Estimator:
             boundary_energy=0.5 * float(np.mean(self._b * np.sum((self._x - self.sheet.rest) ** 2, axis=1))),
             update_s=time.perf_counter() - seen,
             perception_s=seen - began,
+            converged=bool(update.converged),
         )
 
     def _believe(self, stated: Stated) -> None:
@@ -294,6 +307,7 @@ class Estimator:
         """Build the model once the rest shape is known."""
         if self._sheet is None:
             self._sheet = self._points.start(self._still)
+        check_unfolded(self._sheet.rest, self._sheet.faces)
         mesh = SheetMesh(self._sheet.rest, self._sheet.faces)
         self._field = MeshField(SheetPlane.through(mesh.rest).flatten(mesh.rest), mesh.faces)
         found, self._belief = self._build(mesh)

@@ -87,7 +87,11 @@ def result(
             "prior": _number(prior_entropy),
             "final": _number(estimates[-1].entropy) if estimates else None,
         },
-        "frames": {"used": len(estimates), "skipped": [{"index": index, "why": why} for index, why in skipped]},
+        "frames": {
+            "used": len(estimates),
+            "skipped": [{"index": index, "why": why} for index, why in skipped],
+            "not_converged": [estimate.index for estimate in estimates if not estimate.converged],
+        },
         "timing": {
             "update_s": {
                 "median": float(np.median(update)) if len(update) else None,

@@ -327,6 +327,8 @@ def _show(figures: dict, out: Path, as_json: bool) -> None:
         console.print(", ".join(parts))
     for skipped in figures["frames"]["skipped"]:
         console.print(f"frame {skipped['index']} skipped: {skipped['why']}")
+    for index in figures["frames"]["not_converged"]:
+        console.print(f"frame {index}: the search for the sheet's state was cut off; trust it less.")
     console.print(f"report: {out / 'report.html'}")
     if as_json:
         print(json.dumps(figures))

@@ -45,6 +45,8 @@ class Estimate:
     """Wall time of the filter's update [s]."""
     perception_s: float
     """Wall time of perception [s]."""
+    converged: bool = True
+    """Whether the search for the positions came to an end; if not, trust the frame less."""
 
 
 @dataclass(frozen=True, kw_only=True)

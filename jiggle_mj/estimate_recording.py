@@ -39,6 +39,7 @@ DIAGNOSTICS_SCHEMA: dict[str, object] = {
         "nis": {"type": ["number", "null"], "description": "normalised innovation squared per degree of freedom"},
         "boundary_energy": {"type": ["number", "null"], "description": "mean energy in the attachments [J]"},
         "skipped": {"type": "integer", "description": "observations skipped so far"},
+        "converged": {"type": "boolean", "description": "whether the search for the positions came to an end"},
     },
     "required": ["index", "entropy", "nis", "boundary_energy", "skipped"],
 }
@@ -97,7 +98,7 @@ class EstimateWriter:
         output.json(
             DIAGNOSTICS,
             time,
-            {"index": int(estimate.index), "skipped": n_skipped, **numbers},
+            {"index": int(estimate.index), "skipped": n_skipped, "converged": estimate.converged, **numbers},
             schema=DIAGNOSTICS_SCHEMA,
         )
         output.flush()
@@ -189,6 +190,7 @@ def _parse(points: Message, diagnostics: Message) -> Estimate:
         held=columns["held"].astype(bool),
         update_s=0.0,
         perception_s=0.0,
+        converged=said.get("converged", True),
         **numbers,
     )
 

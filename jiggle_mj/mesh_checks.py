@@ -12,6 +12,8 @@ from jiggle_mj.errors import MeshError
 
 MINIMUM_RELATIVE_AREA = 1e-6
 """Twice a triangle's area over its longest edge squared, below which it has no usable normal in float32."""
+STEEP, STEEP_SHARE = 0.2, 0.05
+"""Cosine between normals below which a triangle stands on edge, and the share of such that a rough sheet may have."""
 
 
 def check_mesh(vertices: Shaped[np.ndarray, "..."], faces: Shaped[np.ndarray, "..."]) -> None:
@@ -40,6 +42,27 @@ def check_mesh(vertices: Shaped[np.ndarray, "..."], faces: Shaped[np.ndarray, ".
     _check_areas(vertices, faces)
     _check_orientation(faces)
     _check_one_piece(len(vertices), faces)
+
+
+def check_unfolded(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+    """Refuse a rest shape that does not lie open when seen along its normal.
+
+    Raises:
+        MeshError: a triangle is turned over against the whole, or more than `STEEP_SHARE` of them stand up: the sheet
+            is folded, or touches itself.
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    rest = vertices - vertices.mean(axis=0)
+    above = np.linalg.svd(rest, full_matrices=False)[2][2]
+    upright = normals @ above * np.sign(np.sum(normals @ above))
+    turned, steep = int(np.sum(upright < 0)), int(np.sum(np.abs(upright) < STEEP))
+    if turned or steep > STEEP_SHARE * len(faces):
+        raise MeshError(
+            f"the sheet at rest is folded: seen along its normal, {turned} of {len(faces)} triangles are turned over "
+            f"and {steep} stand on edge. Spread the tissue before the first grasp, or declare a mesh of it spread."
+        )
 
 
 def _check_indices(n_vertices: int, faces: Int[np.ndarray, "f 3"]) -> None:

@@ -1,12 +1,17 @@
 """Settings that every test shares: offscreen OpenGL, JAX on the CPU in float64, strict promotion, checked signatures.
 
-The environment is set before mujoco or jax is imported, which is when they read it.
+The environment is set before mujoco or jax is imported, which is when they read it. What one process of a run has
+compiled, the others take over.
 """
 
 import os
+import tempfile
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ["JAX_PLATFORMS"] = "cpu"
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    compiled = tempfile.TemporaryDirectory()
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = compiled.name
 
 import itertools
 from collections.abc import Callable

@@ -12,7 +12,7 @@ KEYS = {
     "tracking": {"rms_m": None},
     "safety": dict.fromkeys(("limit_j", "max_mean_boundary_energy_j", "violations")),
     "entropy": dict.fromkeys(("prior", "final")),
-    "frames": dict.fromkeys(("used", "skipped")),
+    "frames": dict.fromkeys(("used", "skipped", "not_converged")),
     "timing": {
         "update_s": dict.fromkeys(("median", "p95")),
         **dict.fromkeys(("perception_s", "plan_s", "simulation_s")),

@@ -37,6 +37,7 @@ def estimate(index: int, **changes) -> Estimate:
         "boundary_energy": 1e-7 / 3,
         "update_s": 0.123 * (index + 1),
         "perception_s": 0.456,
+        "converged": index != 1,
     }
     return Estimate(**(values | changes))
 

@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.estimator.perception import Track
 from perception_plane import camera
 from small_sheet import DECLARATION, GRIP_RADIUS, SPACING, attached, lifts, sheet
 
 from jiggle_mj.errors import MeshError, PerceptionError, RecordingError
-from jiggle_mj.observation import MeasuredPoints, Observation, StereoPair, ToolState
+from jiggle_mj.observation import DeclaredMesh, MeasuredPoints, Observation, StereoPair, ToolState
 
 NOISE = 5e-5
 CONFIG = EstimatorConfig(force_sd=5e-4)
@@ -253,6 +254,41 @@ def test_settings_out_of_range_are_refused(change):
     ((name, _),) = change.items()
     with pytest.raises(ValueError, match=rf"EstimatorConfig\.{name} must be above 0"):
         EstimatorConfig(**change)
+
+
+@pytest.mark.parametrize("change", [{"grip_stiffness": 1e8}, {"reference": 1e-8}])
+def test_settings_that_float32_cannot_add_to_the_membranes_stiffness_are_refused(change):
+    ((name, _),) = change.items()
+    with pytest.raises(ValueError, match=rf"EstimatorConfig\.{name} is a share .* between 1e-07 and 1e\+07"):
+        EstimatorConfig(**change)
+
+
+def folded() -> DeclaredMesh:
+    """The sheet's right part turned over onto its left, 1 mm above it."""
+    rest = sheet().rest.copy()
+    right = rest[:, 0] > 5e-3
+    rest[right] = np.column_stack([1e-2 - rest[right, 0], rest[right, 1], np.full(right.sum(), 1e-3)])
+    return DeclaredMesh(vertices=rest, faces=sheet().faces, track_id=np.arange(sheet().n))
+
+
+def test_a_sheet_that_is_folded_at_rest_is_refused_with_what_to_do():
+    declared = folded()
+    estimator = Estimator(dataclasses.replace(DECLARATION, mesh=declared))
+    tip = sheet().rest[0] + 1e-3
+    for index, closed in enumerate((False, False, True)):
+        one = observe(index, declared.vertices, tip, int(closed), closed=closed)
+        if closed:
+            with pytest.raises(MeshError, match=r"folded: .* triangles are turned over .* Spread the tissue"):
+                estimator.update(one)
+        else:
+            assert estimator.update(one) is None
+
+
+def test_a_covariance_that_is_not_positive_definite_is_refused_by_the_particles_number():
+    covariance = np.tile(1e-8 * np.eye(3), (4, 1, 1))
+    covariance[2, 0, 0] = -1e-8
+    with pytest.raises(PerceptionError, match="covariance of particle 2 is not positive definite"):
+        Track(positions=np.zeros((4, 3)), covariance=covariance, visible=np.ones(4, bool))
 
 
 def test_an_update_of_no_sample_is_refused():

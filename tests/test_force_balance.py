@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jiggle_mj.estimator.filters import force_balance
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.filters.force_balance import FAINT, ForceBalance
 from small_sheet import DECLARATION, attached, dense, lifts, sheet, sheet_balance, sheet_energy
@@ -77,6 +78,16 @@ def test_at_a_weld_the_reaction_force_shows(balance):
     assert moved[attached()].max() < 1e-5
     found = information(balance, jnp.asarray(frame.x), s, evidence(frame, 2))
     assert np.diagonal(found.precision)[attached()].max() > 1 / 0.5**2
+
+
+def test_a_search_that_is_cut_off_says_so(balance, monkeypatch):
+    """From what was seen, crumpled by its noise, it takes several steps; one is not enough."""
+    seen, s = evidence(lifts()[3], 3), jnp.zeros(N)
+    search = eqx.filter_jit(lambda: balance.approach(seen.y, s, seen).converged)
+    assert search()
+    monkeypatch.setattr(force_balance, "STATE_STEPS", 1)
+    cut_off = eqx.filter_jit(lambda: balance.approach(seen.y, s, seen).converged)
+    assert not cut_off()
 
 
 def test_evidence_only_sharpens(balance):

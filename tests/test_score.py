@@ -46,7 +46,7 @@ def estimate(index: int) -> Estimate:
     )
 
 
-ESTIMATES = [estimate(0), estimate(2)]
+ESTIMATES = [estimate(0), replace(estimate(2), converged=False)]
 TRUTH = Truth(
     rest=REST,
     faces=FACES,
@@ -92,6 +92,7 @@ def test_the_estimators_own_figures_by_hand():
     figures = unscored()
     assert (figures["n_particles"], figures["n_frames"], figures["frames"]["used"]) == (6, 5, 2)
     assert figures["frames"]["skipped"] == [{"index": 1, "why": "NaN in the pose"}]
+    assert figures["frames"]["not_converged"] == [2]
     assert figures["timing"]["update_s"] == pytest.approx({"median": 0.2, "p95": 0.29})
     assert figures["entropy"] == {"prior": 9.0, "final": 3.0}
     assert figures["detection"]["n_detected"] == 2 and figures["detection"]["n_attached"] is None

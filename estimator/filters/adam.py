@@ -53,6 +53,7 @@ class AdamShooting(Filter):
             probability=not_stated(b),
             entropy=none[0],
             nis=none[0],
+            converged=jnp.asarray(True),
         )
 
 

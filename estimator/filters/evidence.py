@@ -57,6 +57,8 @@ class Update(Stated):
     """State after the update [m]."""
     nis: Float[Array, ""]
     """Normalised innovation squared per degree of freedom, before the update; 1 where the stated noises are right."""
+    converged: Bool[Array, ""]
+    """Whether the search for the state came to an end, or was cut off; true where nothing is searched."""
 
 
 class Filter(ABC):

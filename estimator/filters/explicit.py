@@ -69,6 +69,7 @@ class MultipleShooting(Filter):
             probability=not_stated(b),
             entropy=entropy(factor),
             nis=nis,
+            converged=jnp.asarray(True),
         )
 
 

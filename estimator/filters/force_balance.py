@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.block_tridiagonal import (
     BlockCholesky,
     Layout,
@@ -126,7 +126,8 @@ class ForceBalance(eqx.Module):
 
         shapes = jax.eval_shape(lambda: self.linearise(x, s, evidence))
         unlooked = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
-        return jax.lax.while_loop(unfinished, step, (unlooked, x, jnp.asarray(True), jnp.asarray(0)))[0]
+        frame, _, gaining, _ = jax.lax.while_loop(unfinished, step, (unlooked, x, jnp.asarray(True), jnp.asarray(0)))
+        return eqx.tree_at(lambda one: one.converged, frame, ~gaining)
 
     def polish(self, frame: "Frame", s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
         """The state for a new s, by a few steps with the factor at hand."""
@@ -154,6 +155,7 @@ class ForceBalance(eqx.Module):
             rows=rows,
             weight=weight,
             factor=cholesky(matrix),
+            converged=jnp.asarray(True),
             off=jnp.where(jnp.trace(evidence.precision, axis1=1, axis2=2)[:, None] > 0, evidence.y - x, 0.0),
         )
 
@@ -256,6 +258,8 @@ class Frame(eqx.Module):
     """Of A."""
     off: Float[Array, "n 3"]
     """y - x, zero where nothing was seen [m]."""
+    converged: Bool[Array, ""]
+    """Whether the search for x, if there was one, came to an end."""
 
 
 class Information(eqx.Module):

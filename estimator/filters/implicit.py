@@ -120,7 +120,8 @@ def _update(
     nis = _normalised_innovation(found, gaussian.factor, evidence)
     belief = belief.sweep(gaussian).refine(SWEEPS - 1)
     stated = _stated(belief)
-    return Update(**vars(stated), x=balance.polish(frame, belief.bounded(stated.b), evidence), nis=nis), found
+    x = balance.polish(frame, belief.bounded(stated.b), evidence)
+    return Update(**vars(stated), x=x, nis=nis, converged=frame.converged), found
 
 
 @eqx.filter_jit

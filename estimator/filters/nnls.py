@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Tether
-from jiggle_mj.estimator.equilibrium import equilibrium
+from jiggle_mj.estimator.equilibrium import Equilibrium, equilibrium
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
 
 
@@ -42,7 +42,8 @@ class NonNegativeLeastSquares(eqx.Module, Filter):
         self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:
         """See `Filter.update`; the search for the smooth state begins at `start`, with springs b."""
-        x = self._smooth(b, evidence, start)
+        smooth = self._smooth(b, evidence, start)
+        x = smooth.x
         weight = jnp.where(evidence.loaded, 0.0, self.force_sd**-2)
         d, force = x - self.energy.rest, self.energy.gradient(x, jnp.zeros_like(b))
         gained, pulled = weight * jnp.sum(d**2, axis=1), -weight * jnp.sum(d * force, axis=1)
@@ -61,11 +62,12 @@ class NonNegativeLeastSquares(eqx.Module, Filter):
             probability=not_stated(b),
             entropy=entropy(factor),
             nis=(jnp.sum(innovation) - explained) / degrees,
+            converged=smooth.converged,
         )
 
-    def _smooth(self, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    def _smooth(self, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]) -> Equilibrium:
         """The sheet on springs that pull with tau where it is one standard deviation off."""
         sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), 1e-12))
         pull = (self.force_sd * sd)[:, None, None] * evidence.precision
         tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
-        return equilibrium(tethered, b, start, force_tolerance=self.force_sd / 4, max_steps=25).x
+        return equilibrium(tethered, b, start, force_tolerance=self.force_sd / 4, max_steps=25)

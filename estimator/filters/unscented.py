@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.belief import BoundaryBelief, entropy, non_negative_minimum
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
@@ -69,7 +69,7 @@ class ReducedUnscented(Filter):
         grip = Grip(vertices=self._gripped.terms[-1].vertices, tip=pull.tip, length=pull.length, stiffness=stiff)
         gripped = eqx.tree_at(lambda energy: energy.terms[-1], self._gripped, grip)
         patch = jnp.asarray(self._patch)
-        self._state, x, nis = update(
+        self._state, x, nis, converged = update(
             gripped, patch, self._state, evidence, start, force_tolerance=jnp.asarray(self._force_tolerance)
         )
         mean, covariance = self._state.moments()
@@ -84,6 +84,7 @@ class ReducedUnscented(Filter):
             probability=not_stated(b),
             entropy=entropy(jnp.linalg.cholesky(marginals.precision)),
             nis=nis,
+            converged=converged,
         )
 
 
@@ -96,18 +97,19 @@ def update(
     start: Float[Array, "n 3"],
     *,
     force_tolerance: Float[Array, ""],
-) -> tuple[BoundaryBelief, Float[Array, "n 3"], Float[Array, ""]]:
-    """The reduced belief after one frame, the mean sheet, and the squared innovation per degree of freedom."""
+) -> tuple[BoundaryBelief, Float[Array, "n 3"], Float[Array, ""], Bool[Array, ""]]:
+    """The reduced belief after one frame, the mean sheet, the squared innovation per dof, and whether all settled."""
     mean, covariance = state.moments()
     r = len(mean)
     root, simplex = jnp.linalg.cholesky(covariance), jnp.asarray(simplex_points(r))
 
     def sheet(theta, x):
         b = jnp.maximum(theta, 0)[patch]
-        return equilibrium(gripped, b, x, force_tolerance=force_tolerance, max_steps=STEPS).x
+        found = equilibrium(gripped, b, x, force_tolerance=force_tolerance, max_steps=STEPS)
+        return found.x, found.converged
 
-    middle = sheet(mean, start)
-    ends = jax.lax.map(lambda point: sheet(mean + root @ point, middle), simplex)
+    middle, converged = sheet(mean, start)
+    ends, all_converged = jax.lax.map(lambda point: sheet(mean + root @ point, middle), simplex)
     centre = jnp.mean(ends, axis=0)
     slope = jnp.einsum("jni,jr->rni", ends - centre[None], solve_triangular(root, simplex.T, lower=True, trans=1).T)
     slope = slope / (r + 1)
@@ -118,7 +120,8 @@ def update(
     explained = pulled @ cho_solve((jnp.linalg.cholesky(after.precision), True), pulled)
     squared = jnp.einsum("ni,nij,nj->", residual, evidence.precision, residual)
     observed = 3 * jnp.maximum(jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0), 1)
-    return after, centre, (squared - explained) / observed.astype(mean.dtype)
+    nis = (squared - explained) / observed.astype(mean.dtype)
+    return after, centre, nis, converged & jnp.all(all_converged)
 
 
 def patches(rest: Float[np.ndarray, "n 3"], r: int) -> Int[np.ndarray, " n"]:

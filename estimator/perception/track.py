@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jiggle_mj.errors import PerceptionError
+
 UNSEEN_VARIANCE = 1.0
 """Variance of a coordinate of a particle that was not seen: as good as unknown [m^2]."""
 
@@ -20,3 +22,13 @@ class Track:
     visible: Bool[np.ndarray, " n"]
     uvd: Float[np.ndarray, "n 3"] | None = None
     """Left rectified pixel and disparity [px], the best guess where unseen; None without images."""
+
+    def __post_init__(self) -> None:
+        """Check the covariances."""
+        symmetric = np.allclose(self.covariance, self.covariance.transpose(0, 2, 1), rtol=1e-6, atol=0)
+        definite = np.linalg.eigvalsh(self.covariance)[:, 0] > 0
+        if not (symmetric and definite.all()):
+            bad = int(np.argmin(definite))
+            raise PerceptionError(
+                f"the covariance of particle {bad} is not positive definite: {self.covariance[bad].tolist()} m^2."
+            )
