@@ -67,18 +67,22 @@ class Case:
         return pull.before
 
 
-def square(n: int) -> SheetMesh:
-    """About n particles, equilateral, at the default spacing."""
-    columns = round(np.sqrt(n * np.sqrt(0.75)))
-    rows = round(n / columns)
+def equilateral(columns: int, rows: int, spacing: float) -> SheetMesh:
+    """Equilateral triangles only: offset rows with a zigzag outline; spacing [m]."""
     place = [(i + 0.5 * (j % 2), j * np.sqrt(0.75), 0.0) for j in range(rows) for i in range(columns)]
     faces = []
     for j in range(rows - 1):
         for i in range(columns - 1):
             a, b, c, d = j * columns + i, j * columns + i + 1, (j + 1) * columns + i, (j + 1) * columns + i + 1
             faces += [(a, b, d), (a, d, c)] if j % 2 else [(a, b, c), (b, d, c)]
-    rest = EstimatorConfig().spacing * np.array(place)
+    rest = spacing * np.array(place)
     return SheetMesh(rest - rest.mean(axis=0), np.array(faces))
+
+
+def square(n: int) -> SheetMesh:
+    """About n particles at the default spacing."""
+    columns = round(np.sqrt(n * np.sqrt(0.75)))
+    return equilateral(columns, round(n / columns), EstimatorConfig().spacing)
 
 
 def case(n: int) -> Case:

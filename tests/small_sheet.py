@@ -16,6 +16,7 @@ from jiggle_mj.estimator.filters.force_balance import ForceBalance
 from jiggle_mj.estimator.filters.implicit import prior_belief
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.surrogate import surrogate
+from jiggle_mj.eval import benchmark
 
 from jiggle_mj.observation import Declaration
 
@@ -36,15 +37,8 @@ search = eqx.filter_jit(equilibrium)
 
 
 def equilateral(columns: int, rows: int, spacing: float = SPACING) -> SheetMesh:
-    """Equilateral triangles only: offset rows with a zigzag outline."""
-    place = [(i + 0.5 * (j % 2), j * np.sqrt(0.75), 0.0) for j in range(rows) for i in range(columns)]
-    faces = []
-    for j in range(rows - 1):
-        for i in range(columns - 1):
-            a, b, c, d = j * columns + i, j * columns + i + 1, (j + 1) * columns + i, (j + 1) * columns + i + 1
-            faces += [(a, b, d), (a, d, c)] if j % 2 else [(a, b, c), (b, d, c)]
-    rest = spacing * np.array(place)
-    return SheetMesh(rest - rest.mean(axis=0), np.array(faces))
+    """The benchmark's, at this file's spacing."""
+    return benchmark.equilateral(columns, rows, spacing)
 
 
 def jittered(mesh: SheetMesh, share: float, seed: int = 0) -> SheetMesh:

@@ -31,9 +31,8 @@ from jiggle_mj.estimator.block_tridiagonal import (
     window_sums,
 )
 from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.environment import Tether
-from jiggle_mj.estimator.equilibrium import equilibrium
 from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.tethered import Tethered
 from jiggle_mj.estimator.mesh import SheetMesh, pattern
 
 
@@ -41,8 +40,7 @@ class ForceBalance(eqx.Module):
     """The balance of forces of one sheet, to be linearised at any state."""
 
     energy: SheetEnergy
-    tethered: SheetEnergy
-    """The same, with springs to the observed positions as its last term."""
+    tethered: Tethered
     neighbours: Int[Array, "n p"]
     """Particles coupled to each, itself included, padded with n."""
     slots: tuple[Int[Array, "_m _p _p"], ...]
@@ -87,7 +85,7 @@ class ForceBalance(eqx.Module):
         layout = Layout.from_pattern(pattern(mesh.n, np.column_stack(coupled.nonzero())), mesh.rest)
         return cls(
             energy=energy,
-            tethered=SheetEnergy.build(mesh.rest, (*energy.terms, Tether.build(mesh.rest)), energy.layout),
+            tethered=Tethered.build(energy, force_sd=force_sd),
             neighbours=jnp.asarray(np.where(neighbours < 0, mesh.n, neighbours)),
             slots=slots,
             layout=layout,
@@ -99,18 +97,9 @@ class ForceBalance(eqx.Module):
         )
 
     def settle(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
-        """Equilibrium at fixed s of the sheet tethered to the observed positions, searched from x.
-
-        A tether pulls with tau when a particle is one standard deviation off, so that the outcome nearly balances
-        forces and nearly fits, where the raw observation would be crumpled by its noise far outside the linear range.
-        """
-        sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), 1e-12))
-        pull = (self.force_sd * sd)[:, None, None] * evidence.precision
-        stiff = self.grip_stiffness * jnp.eye(3, dtype=x.dtype)
-        pull = jnp.where(evidence.held[:, None, None], stiff, pull)
-        tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
-        b = self.reference * s / (1 - s)
-        return equilibrium(tethered, b, x, force_tolerance=self.force_sd, max_steps=25).x
+        """Equilibrium at fixed s of the sheet tethered to the observed positions, searched from x."""
+        b, stiff = self.reference * s / (1 - s), self.grip_stiffness
+        return self.tethered.settle(b, evidence, x, force_tolerance=self.force_sd, grip_stiffness=stiff).x
 
     def approach(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> "Frame":
         """Linearise where a Gauss-Newton step on the state alone, at fixed s, gains no more than `SETTLED`."""

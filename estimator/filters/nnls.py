@@ -12,29 +12,25 @@ forces that are wrong by tau independently.
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
 from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.environment import Tether
-from jiggle_mj.estimator.equilibrium import Equilibrium, equilibrium
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
+from jiggle_mj.estimator.filters.tethered import Tethered
 
 
 class NonNegativeLeastSquares(eqx.Module, Filter):
     """The regression for one sheet; the frames so far are in the belief."""
 
     energy: SheetEnergy
-    tethered: SheetEnergy
-    """The same, with springs to the observed positions as its last term."""
+    tethered: Tethered
     force_sd: Float[Array, ""]
     """tau [N]."""
 
     @classmethod
     def build(cls, energy: SheetEnergy, *, force_sd: float) -> "NonNegativeLeastSquares":
         """For a sheet's energy without attachments; force_sd [N]."""
-        rest = np.asarray(energy.rest)
-        tethered = SheetEnergy.build(rest, (*energy.terms, Tether.build(rest)), energy.layout)
+        tethered = Tethered.build(energy, force_sd=force_sd)
         return cls(energy=energy, tethered=tethered, force_sd=jnp.asarray(force_sd, dtype=float))
 
     @eqx.filter_jit
@@ -42,7 +38,7 @@ class NonNegativeLeastSquares(eqx.Module, Filter):
         self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:
         """See `Filter.update`; the search for the smooth state begins at `start`, with springs b."""
-        smooth = self._smooth(b, evidence, start)
+        smooth = self.tethered.settle(b, evidence, start, force_tolerance=self.force_sd / 4)
         x = smooth.x
         weight = jnp.where(evidence.loaded, 0.0, self.force_sd**-2)
         d, force = x - self.energy.rest, self.energy.gradient(x, jnp.zeros_like(b))
@@ -64,10 +60,3 @@ class NonNegativeLeastSquares(eqx.Module, Filter):
             nis=(jnp.sum(innovation) - explained) / degrees,
             converged=smooth.converged,
         )
-
-    def _smooth(self, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]) -> Equilibrium:
-        """The sheet on springs that pull with tau where it is one standard deviation off."""
-        sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), 1e-12))
-        pull = (self.force_sd * sd)[:, None, None] * evidence.precision
-        tethered = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.tethered, (evidence.y, pull))
-        return equilibrium(tethered, b, start, force_tolerance=self.force_sd / 4, max_steps=25)
