@@ -16,10 +16,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float, Int
 from jiggle_mj.estimator.belief import entropy
 from jiggle_mj.estimator.block_tridiagonal import lower_inverse
+from jiggle_mj.estimator.mesh import neighbour_table
 from jiggle_mj.estimator.spike_and_slab import Mixture, SpikeAndSlab
 
 
@@ -47,20 +49,14 @@ class AttachmentPrior(eqx.Module):
         coupling: float,
     ) -> "AttachmentPrior":
         """For n particles; `probability` is that of one none of whose neighbours is attached."""
-        near: list[list[int]] = [[] for _ in range(n)]
-        for i, j in edges.tolist():
-            near[i].append(j)
-            near[j].append(i)
-        width = max(map(len, near))
-        neighbours, back = np.full((n, width), n), np.zeros((n, width), int)
-        for i, others in enumerate(near):
-            neighbours[i, : len(others)] = others
-            back[i, : len(others)] = [near[j].index(i) for j in others]
+        i, j = np.concatenate([edges, edges[:, ::-1]]).T
+        table = neighbour_table(sp.csr_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(n, n)))
+        back = np.argmax(table[table] == np.arange(n)[:, None, None], axis=2)
         return cls(
             stiffness=stiffness,
             log_odds=jnp.asarray(np.log(probability) - np.log1p(-probability)),
             coupling=jnp.asarray(coupling, dtype=float),
-            neighbours=jnp.asarray(neighbours),
+            neighbours=jnp.asarray(np.where(table < 0, n, table)),
             back=jnp.asarray(back),
         )
 

@@ -5,28 +5,20 @@ goes perception -> grip -> filter. Sees nothing but observations, the camera's c
 """
 
 import time
-from dataclasses import dataclass
-from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.blas import one_thread
-from jiggle_mj.estimator.filters.adam import AdamShooting
+from jiggle_mj.estimator.config import EstimatorConfig
+from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull, Stated
-from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
-from jiggle_mj.estimator.filters.force_balance import ForceBalance
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
-from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
-from jiggle_mj.estimator.filters.unscented import ReducedUnscented
 from jiggle_mj.estimator.grip import GripHold
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.perception import Disparity, PointTracker, StereoTracker, TissueMask, Track
 from jiggle_mj.estimator.perception.mesh_field import MeshField
-from jiggle_mj.estimator.surrogate import Membrane, surrogate
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
@@ -35,73 +27,8 @@ from jiggle_mj.mesh_checks import check_unfolded
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
-FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class EstimatorConfig:
-    """Settings of the estimator; stiffnesses are shares of the declared membrane stiffness k."""
-
-    spacing: float = 4.4e-3
-    """Between the particles of a mesh laid over images [m]."""
-    filter: FilterName = "implicit"
-    """How a frame enters the belief: through the balance of forces, or, as in the paper, through a simulated step; the
-    others are baselines: gradient descent on that step, least squares on the forces, and patches through equilibria."""
-    samples: int = 1
-    """Frames that each update of the explicit filter or of adam simulates, the latest among them."""
-    membrane: Membrane = "triangles"
-    """Law of the sheet's plane where no step is simulated: St Venant-Kirchhoff triangles, or springs along edges."""
-    reference: float = 1.0
-    """Attachment stiffness in the middle of the implicit filter's scale from free to rigid [k]."""
-    prior_sd: float = 1 / 75
-    """Standard deviation of each attachment stiffness before anything is seen, for the other filters [k]."""
-    force_sd: float = 4.5e-3
-    """Standard deviation of the force that the model gets wrong on a particle [k x spacing]."""
-    anchor_sd: float = 1e-4
-    """How far a welded particle may be from its anchor, for the implicit filter [m]."""
-    grip_sd: float = 1.5e-3
-    """How well held particles follow the tip [m]."""
-    grip_stiffness: float = 3.0
-    """Of the springs that carry held particles with the tip while the state is searched [k]."""
-    detect_above: float = 0.011
-    """Filters that state no probability report a particle attached when its mean stiffness exceeds this [k]."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in POSITIVE:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"EstimatorConfig.{name} must be above 0; got {getattr(self, name)}.")
-        for name in SHARES:
-            share = getattr(self, name)
-            if not 1 / LARGEST_RATIO <= share <= LARGEST_RATIO:
-                raise ValueError(
-                    f"EstimatorConfig.{name} is a share of the membrane stiffness and must lie between "
-                    f"{1 / LARGEST_RATIO:g} and {LARGEST_RATIO:g}, what float32 can add to it; got {share}."
-                )
-        if self.filter not in get_args(FilterName):
-            raise ValueError(f"EstimatorConfig.filter must be one of {get_args(FilterName)}; got {self.filter!r}.")
-        if not (isinstance(self.samples, int) and self.samples >= 1):
-            raise ValueError(f"EstimatorConfig.samples must be an integer of at least 1; got {self.samples}.")
-        if self.membrane not in ("triangles", "edges"):
-            raise ValueError(f"EstimatorConfig.membrane must be 'triangles' or 'edges'; got {self.membrane!r}.")
-
-
 RULE = "P(attached) > 0.5"
 """Of filters that state a probability."""
-POSITIVE = (
-    "spacing",
-    "reference",
-    "prior_sd",
-    "force_sd",
-    "anchor_sd",
-    "grip_sd",
-    "grip_stiffness",
-    "detect_above",
-)
-"""Settings that must be above 0."""
-
-SHARES, LARGEST_RATIO = ("reference", "prior_sd", "force_sd", "grip_stiffness", "detect_above"), 1e7
-"""Settings that are shares of the membrane stiffness, and how far from it they may be either way."""
 
 
 class Estimator:
@@ -307,39 +234,13 @@ class Estimator:
         """Build the model once the rest shape is known."""
         if self._sheet is None:
             self._sheet = self._points.start(self._still)
-        check_unfolded(self._sheet.rest, self._sheet.faces)
-        mesh = SheetMesh(self._sheet.rest, self._sheet.faces)
-        self._field = MeshField(SheetPlane.through(mesh.rest).flatten(mesh.rest), mesh.faces)
-        found, self._belief = self._build(mesh)
+        mesh, plane = SheetMesh(self._sheet.rest, self._sheet.faces), SheetPlane.through(self._sheet.rest)
+        check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
+        self._field = MeshField(plane.flatten(mesh.rest), mesh.faces)
+        found, self._belief = build_filter(mesh, self.declaration, self.config)
         self.prior_entropy = float(self._belief.entropy())
         self._x, self._b, self._probability = mesh.rest, np.zeros(mesh.n), np.full(mesh.n, np.nan)
         return found
-
-    def _build(self, mesh: SheetMesh) -> tuple[Filter, BoundaryBelief | AttachmentBelief]:
-        """The filter that the settings name, and what it believes beforehand."""
-        config, k = self.config, self.declaration.membrane_stiffness
-        grip_stiffness, force_sd = config.grip_stiffness * k, config.force_sd * k * mesh.spacing
-        mean = PRIOR_MEAN if config.filter == "explicit" else 0.0
-        gaussian = BoundaryBelief.prior(mesh.n, mean=mean, sd=config.prior_sd * k)
-        if config.filter in ("explicit", "adam"):
-            shooting = MultipleShooting if config.filter == "explicit" else AdamShooting
-            return shooting(mesh, self.declaration, grip_stiffness=grip_stiffness, samples=config.samples), gaussian
-        energy = surrogate(mesh, self.declaration, membrane=config.membrane)
-        if config.filter == "nnls":
-            return NonNegativeLeastSquares.build(energy, force_sd=force_sd), gaussian
-        if config.filter == "unscented":
-            tolerance = force_sd / 4
-            return ReducedUnscented(mesh, energy, grip_stiffness=grip_stiffness, force_tolerance=tolerance), gaussian
-        reference = config.reference * k
-        balance = ForceBalance.build(
-            mesh,
-            energy,
-            reference=reference,
-            force_sd=force_sd,
-            anchor_sd=config.anchor_sd,
-            grip_stiffness=grip_stiffness,
-        )
-        return ImplicitFilter(balance), prior_belief(mesh, reference=reference)
 
     def _see(self, observation: Observation) -> Track:
         if observation.images is not None and self._stereo is not None:

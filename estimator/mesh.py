@@ -81,3 +81,13 @@ def pattern(n: int, pairs: Int[np.ndarray, "m 2"]) -> sp.csr_matrix:
     """Symmetric n x n boolean pattern with the given pairs and the diagonal."""
     i, j = np.concatenate([pairs, pairs[:, ::-1], np.repeat(np.arange(n)[:, None], 2, axis=1)]).T
     return sp.csr_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(n, n))
+
+
+def neighbour_table(near: sp.csr_matrix) -> Int[np.ndarray, "n p"]:
+    """Columns of each row of a pattern, in ascending order, padded with -1."""
+    near = near.sorted_indices()
+    degree = np.diff(near.indptr)
+    table = np.full((len(degree), degree.max()), -1)
+    place = np.arange(len(near.indices)) - np.repeat(near.indptr[:-1], degree)
+    table[np.repeat(np.arange(len(degree)), degree), place] = near.indices
+    return table

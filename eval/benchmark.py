@@ -23,10 +23,8 @@ from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
+from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
-from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
-from jiggle_mj.estimator.filters.force_balance import ForceBalance
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.surrogate import surrogate
 
@@ -131,7 +129,7 @@ def benchmark(sizes: tuple[int, ...], *, explicit: bool, say: Callable[[str], No
             one = case(n)
             compiled, seconds = timed(_equilibrium(one))
             metrics[f"equilibrium_n{n}_s"] = {"value": seconds, "unit": "s"}
-            filter, prior = _implicit(one)
+            filter, prior = build_filter(one.mesh, one.declaration, EstimatorConfig())
             compiled, seconds = timed(partial(_last_frame, filter, prior, one))
             metrics[f"update_n{n}_s"] = {"value": seconds, "unit": "s"}
             metrics[f"update_n{n}_compile_s"] = {"value": compiled, "unit": "s"}
@@ -139,7 +137,8 @@ def benchmark(sizes: tuple[int, ...], *, explicit: bool, say: Callable[[str], No
                 metrics["found_share"] = {"value": _found_share(one), "unit": "share"}
             if explicit and n == sizes[0]:
                 say(f"n = {n}, the paper's filter")
-                _, slow = timed(partial(_last_frame, *_explicit(one), one), repeats=3)
+                paper = build_filter(one.mesh, one.declaration, EstimatorConfig(filter="explicit"))
+                _, slow = timed(partial(_last_frame, *paper, one), repeats=3)
                 metrics[f"update_explicit_n{n}_s"] = {"value": slow, "unit": "s"}
                 metrics["update_explicit_over_implicit"] = {"value": slow / seconds, "unit": "ratio"}
     if len(sizes) > 1:
@@ -185,33 +184,13 @@ def _equilibrium(one: Case) -> Callable[[], object]:
     return lambda: search(one.gripped, one.b, one.before, force_tolerance=tolerance).x
 
 
-def _implicit(one: Case) -> tuple[Filter, AttachmentBelief]:
-    config, k = EstimatorConfig(), one.declaration.membrane_stiffness
-    reference = config.reference * k
-    balance = ForceBalance.build(
-        one.mesh,
-        one.energy,
-        reference=reference,
-        force_sd=config.force_sd * k * one.mesh.spacing,
-        anchor_sd=config.anchor_sd,
-        grip_stiffness=config.grip_stiffness * k,
-    )
-    return ImplicitFilter(balance), prior_belief(one.mesh, reference=reference)
-
-
-def _explicit(one: Case) -> tuple[MultipleShooting, BoundaryBelief]:
-    config, k = EstimatorConfig(), one.declaration.membrane_stiffness
-    shooting = MultipleShooting(one.mesh, one.declaration, grip_stiffness=config.grip_stiffness * k, samples=1)
-    return shooting, BoundaryBelief.prior(one.mesh.n, mean=PRIOR_MEAN, sd=config.prior_sd * k)
-
-
 def _last_frame(filter: Filter, prior: BoundaryBelief | AttachmentBelief, one: Case) -> object:
     return filter.update(prior, jnp.zeros(one.mesh.n), one.frames[-1], one.before)
 
 
 def _found_share(one: Case) -> float:
     """Share of particles rightly called attached or free after all frames."""
-    filter, belief = _implicit(one)
+    filter, belief = build_filter(one.mesh, one.declaration, EstimatorConfig())
     b, x = jnp.zeros(one.mesh.n), jnp.asarray(one.mesh.rest)
     for frame in one.frames:
         update = filter.update(belief, b, frame, x)

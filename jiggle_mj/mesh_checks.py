@@ -44,8 +44,10 @@ def check_mesh(vertices: Shaped[np.ndarray, "..."], faces: Shaped[np.ndarray, ".
     _check_one_piece(len(vertices), faces)
 
 
-def check_unfolded(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> None:
-    """Refuse a rest shape that does not lie open when seen along its normal.
+def check_unfolded(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], *, above: Float[np.ndarray, " 3"]
+) -> None:
+    """Refuse a rest shape that does not lie open when seen along the normal of its best-fit plane, `above`.
 
     Raises:
         MeshError: a triangle is turned over against the whole, or more than `STEEP_SHARE` of them stand up: the sheet
@@ -54,8 +56,6 @@ def check_unfolded(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    rest = vertices - vertices.mean(axis=0)
-    above = np.linalg.svd(rest, full_matrices=False)[2][2]
     upright = normals @ above * np.sign(np.sum(normals @ above))
     turned, steep = int(np.sum(upright < 0)), int(np.sum(np.abs(upright) < STEEP))
     if turned or steep > STEEP_SHARE * len(faces):

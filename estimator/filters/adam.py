@@ -44,13 +44,13 @@ class AdamShooting(Filter):
     ) -> Update:
         """Descend from b on one frame and k - 1 earlier ones; belief and start are not used."""
         b, self._moments = descend(self._simulator, b, self._moments, self._history.add(evidence), rate=self._rate)
-        none = jnp.full_like(b, jnp.nan)
+        none = not_stated(b)
         return Update(
             belief=BoundaryBelief(precision=jnp.broadcast_to(none, (len(b), len(b))), shift=none),
             x=evidence.y,
             b=b,
             sd=none,
-            probability=not_stated(b),
+            probability=none,
             entropy=none[0],
             nis=none[0],
             converged=jnp.asarray(True),

@@ -34,6 +34,11 @@ class Evidence(eqx.Module):
     """Particles that the grip may pull at, the held ones among them, whose balance of forces is unknown."""
     pull: Pull | None = None
 
+    @property
+    def seen(self) -> Bool[Array, " n"]:
+        """Particles of which anything is known, from sight or from the grip."""
+        return jnp.trace(self.precision, axis1=1, axis2=2) > 0
+
 
 class Stated(eqx.Module):
     """What a filter believes; what it does not state (uncertainty, or P(attached)) is NaN."""

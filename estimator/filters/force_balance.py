@@ -17,7 +17,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.block_tridiagonal import (
     BlockCholesky,
@@ -33,7 +32,7 @@ from jiggle_mj.estimator.block_tridiagonal import (
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.filters.tethered import Tethered
-from jiggle_mj.estimator.mesh import SheetMesh, pattern
+from jiggle_mj.estimator.mesh import SheetMesh, neighbour_table, pattern
 
 
 class ForceBalance(eqx.Module):
@@ -69,23 +68,18 @@ class ForceBalance(eqx.Module):
         grip_stiffness: float,
     ) -> "ForceBalance":
         """Prepare the index tables for a mesh and its energy; reference and grip_stiffness [N/m]."""
-        near = sp.csr_array(mesh.adjacency)
-        near.sort_indices()
-        degree = np.diff(near.indptr)
-        neighbours = np.full((mesh.n, degree.max()), -1)
-        column = np.arange(len(near.indices)) - np.repeat(near.indptr[:-1], degree)
-        neighbours[np.repeat(np.arange(mesh.n), degree), column] = near.indices
+        neighbours = neighbour_table(mesh.adjacency)
         position = {(i, j): k for i, row in enumerate(neighbours.tolist()) for k, j in enumerate(row) if j >= 0}
         width = neighbours.shape[1]
         slots = tuple(
             jnp.asarray([[[i * width + position[i, j] for j in element] for i in element] for element in vertices])
             for vertices in (np.asarray(term.vertices).tolist() for term in energy.terms)
         )
-        coupled = sp.csr_array(near.astype(np.int64) @ near.astype(np.int64))
+        coupled = mesh.adjacency.astype(int) @ mesh.adjacency.astype(int)
         layout = Layout.from_pattern(pattern(mesh.n, np.column_stack(coupled.nonzero())), mesh.rest)
         return cls(
             energy=energy,
-            tethered=Tethered.build(energy, force_sd=force_sd),
+            tethered=Tethered.build(energy),
             neighbours=jnp.asarray(np.where(neighbours < 0, mesh.n, neighbours)),
             slots=slots,
             layout=layout,
@@ -99,7 +93,8 @@ class ForceBalance(eqx.Module):
     def settle(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
         """Equilibrium at fixed s of the sheet tethered to the observed positions, searched from x."""
         b, stiff = self.reference * s / (1 - s), self.grip_stiffness
-        return self.tethered.settle(b, evidence, x, force_tolerance=self.force_sd, grip_stiffness=stiff).x
+        sd = self.force_sd
+        return self.tethered.settle(b, evidence, x, force_sd=sd, force_tolerance=sd, grip_stiffness=stiff).x
 
     def approach(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> "Frame":
         """Linearise where a Gauss-Newton step on the state alone, at fixed s, gains no more than `SETTLED`."""
@@ -119,12 +114,8 @@ class ForceBalance(eqx.Module):
         return eqx.tree_at(lambda one: one.converged, frame, ~gaining)
 
     def polish(self, frame: "Frame", s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
-        """The state for a new s, by a few steps with the factor at hand."""
-
-        def step(_, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-            return self._best_along(x, self._state_step(frame, x, s, evidence), s, evidence)[0]
-
-        return jax.lax.fori_loop(0, POLISH_STEPS, step, frame.x)
+        """The state for a new s, by a step with the factor at hand."""
+        return self._best_along(frame.x, self._state_step(frame, frame.x, s, evidence), s, evidence)[0]
 
     def linearise(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> "Frame":
         """The balance of forces around x and s."""
@@ -145,7 +136,7 @@ class ForceBalance(eqx.Module):
             weight=weight,
             factor=cholesky(matrix),
             converged=jnp.asarray(True),
-            off=jnp.where(jnp.trace(evidence.precision, axis1=1, axis2=2)[:, None] > 0, evidence.y - x, 0.0),
+            off=jnp.where(evidence.seen[:, None], evidence.y - x, 0.0),
         )
 
     def information(self, frame: "Frame") -> "Information":
@@ -273,7 +264,5 @@ SETTLED = 0.5
 """A step that lowers the cost by less than this share ends the search for the state."""
 STATE_STEPS = 8
 """Most Gauss-Newton steps on the state alone, before the one on state and belief."""
-POLISH_STEPS = 1
-"""Steps of the state after the belief has changed."""
 FAINT = 1.0
 """Precision that keeps unseen, slack particles solvable: a standard deviation of 1 m [1/m^2]."""

@@ -155,6 +155,6 @@ def _normalised_innovation(found: Information, factor: Float[Array, "n n"], evid
     that of the middle matrix.
     """
     explained = found.pulled @ cho_solve((factor, True), found.pulled)
-    observed = 3 * jnp.sum(jnp.trace(evidence.precision, axis1=1, axis2=2) > 0)
+    observed = 3 * jnp.sum(evidence.seen)
     degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.loaded), 1)
     return (found.squared - explained) / degrees.astype(explained.dtype)

@@ -30,17 +30,17 @@ class NonNegativeLeastSquares(eqx.Module, Filter):
     @classmethod
     def build(cls, energy: SheetEnergy, *, force_sd: float) -> "NonNegativeLeastSquares":
         """For a sheet's energy without attachments; force_sd [N]."""
-        tethered = Tethered.build(energy, force_sd=force_sd)
-        return cls(energy=energy, tethered=tethered, force_sd=jnp.asarray(force_sd, dtype=float))
+        return cls(energy=energy, tethered=Tethered.build(energy), force_sd=jnp.asarray(force_sd, dtype=float))
 
     @eqx.filter_jit
     def update(
         self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:
         """See `Filter.update`; the search for the smooth state begins at `start`, with springs b."""
-        smooth = self.tethered.settle(b, evidence, start, force_tolerance=self.force_sd / 4)
+        sd = self.force_sd
+        smooth = self.tethered.settle(b, evidence, start, force_sd=sd, force_tolerance=sd / 4)
         x = smooth.x
-        weight = jnp.where(evidence.loaded, 0.0, self.force_sd**-2)
+        weight = jnp.where(evidence.loaded, 0.0, sd**-2)
         d, force = x - self.energy.rest, self.energy.gradient(x, jnp.zeros_like(b))
         gained, pulled = weight * jnp.sum(d**2, axis=1), -weight * jnp.sum(d * force, axis=1)
         mean = belief.mean()

@@ -21,15 +21,12 @@ class Tethered(eqx.Module):
 
     energy: SheetEnergy
     """Its last term are the springs."""
-    force_sd: Float[Array, ""]
-    """tau, with which a spring pulls when its particle is one standard deviation off [N]."""
 
     @classmethod
-    def build(cls, energy: SheetEnergy, *, force_sd: float) -> "Tethered":
-        """For a sheet's energy without attachments; force_sd [N]."""
+    def build(cls, energy: SheetEnergy) -> "Tethered":
+        """For a sheet's energy without attachments."""
         rest = np.asarray(energy.rest)
-        energy = SheetEnergy.build(rest, (*energy.terms, Tether.build(rest)), energy.layout)
-        return cls(energy=energy, force_sd=jnp.asarray(force_sd, dtype=float))
+        return cls(energy=SheetEnergy.build(rest, (*energy.terms, Tether.build(rest)), energy.layout))
 
     def settle(
         self,
@@ -37,12 +34,13 @@ class Tethered(eqx.Module):
         evidence: Evidence,
         start: Float[Array, "n 3"],
         *,
+        force_sd: Float[Array, ""],
         force_tolerance: float | Array,
         grip_stiffness: float | Array | None = None,
     ) -> Equilibrium:
         """Equilibrium with attachments b [N/m], searched from `start`; held particles on springs of their own [N/m]."""
         sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), 1e-12))
-        pull = (self.force_sd * sd)[:, None, None] * evidence.precision
+        pull = (force_sd * sd)[:, None, None] * evidence.precision
         if grip_stiffness is not None:
             stiff = grip_stiffness * jnp.eye(3, dtype=start.dtype)
             pull = jnp.where(evidence.held[:, None, None], stiff, pull)

@@ -25,10 +25,11 @@ class Track:
 
     def __post_init__(self) -> None:
         """Check the covariances."""
-        symmetric = np.allclose(self.covariance, self.covariance.transpose(0, 2, 1), rtol=1e-6, atol=0)
+        turned = self.covariance.transpose(0, 2, 1)
+        symmetric = np.isclose(self.covariance, turned, rtol=1e-6, atol=0).all(axis=(1, 2))
         definite = np.linalg.eigvalsh(self.covariance)[:, 0] > 0
-        if not (symmetric and definite.all()):
-            bad = int(np.argmin(definite))
+        if not (symmetric & definite).all():
+            bad = int(np.argmin(symmetric & definite))
             raise PerceptionError(
                 f"the covariance of particle {bad} is not positive definite: {self.covariance[bad].tolist()} m^2."
             )

@@ -1,0 +1,45 @@
+"""The filter that the settings name, for one sheet, and what it believes beforehand."""
+
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.config import EstimatorConfig
+from jiggle_mj.estimator.filters.adam import AdamShooting
+from jiggle_mj.estimator.filters.evidence import Filter
+from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
+from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
+from jiggle_mj.estimator.filters.unscented import ReducedUnscented
+from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.surrogate import surrogate
+
+from jiggle_mj.observation import Declaration
+
+
+def build_filter(
+    mesh: SheetMesh, declaration: Declaration, config: EstimatorConfig
+) -> tuple[Filter, BoundaryBelief | AttachmentBelief]:
+    """A filter and its prior; shares in the settings become stiffnesses of the declared membrane."""
+    k = declaration.membrane_stiffness
+    grip_stiffness, force_sd = config.grip_stiffness * k, config.force_sd * k * mesh.spacing
+    if config.filter == "implicit":
+        reference = config.reference * k
+        balance = ForceBalance.build(
+            mesh,
+            surrogate(mesh, declaration, membrane=config.membrane),
+            reference=reference,
+            force_sd=force_sd,
+            anchor_sd=config.anchor_sd,
+            grip_stiffness=grip_stiffness,
+        )
+        return ImplicitFilter(balance), prior_belief(mesh, reference=reference)
+    mean = PRIOR_MEAN if config.filter == "explicit" else 0.0
+    gaussian = BoundaryBelief.prior(mesh.n, mean=mean, sd=config.prior_sd * k)
+    if config.filter in ("explicit", "adam"):
+        shooting = MultipleShooting if config.filter == "explicit" else AdamShooting
+        return shooting(mesh, declaration, grip_stiffness=grip_stiffness, samples=config.samples), gaussian
+    energy = surrogate(mesh, declaration, membrane=config.membrane)
+    if config.filter == "nnls":
+        return NonNegativeLeastSquares.build(energy, force_sd=force_sd), gaussian
+    tolerance = force_sd / 4
+    return ReducedUnscented(mesh, energy, grip_stiffness=grip_stiffness, force_tolerance=tolerance), gaussian
