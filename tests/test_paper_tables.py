@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from jiggle_mj.eval import paper_tables
-from jiggle_mj.eval.paper_tables import METHODS, RULE, TABLES, Cell, cells, markdown, measure
+from jiggle_mj.eval.paper_tables import METHODS, OWN_FORCE_SD, RULE, TABLES, Cell, cells, markdown, measure
 from jiggle_mj.eval.same_engine import STIFFNESS, sheet
 from test_same_engine import SCENE
 from test_score import scored
@@ -28,7 +28,8 @@ def test_a_same_engine_run_is_scored_and_not_repeated(tmp_path, monkeypatch):
 def test_the_rule_is_half_of_the_references_own_stiffness():
     """Shipped scenes attach with 1 N/m, k = 30 N/m."""
     assert CELL.config.detect_above == pytest.approx(0.005)
-    mujoco = Cell(scene="arc", reference="mujoco", method="Adam")
+    own, mujoco = (Cell(scene="arc", reference=reference, method="Adam") for reference in ("equilibrium", "mujoco"))
+    assert own.config.force_sd == OWN_FORCE_SD < mujoco.config.force_sd == CELL.config.force_sd
     assert mujoco.config.detect_above == pytest.approx(0.5 / 30) and mujoco.config.filter == "adam"
 
 

@@ -10,6 +10,7 @@ from jiggle_mj.estimator.filters.shots import SWEEPS, simulator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.surrogate import surrogate
 from jiggle_mj.eval.metrics import agreement
+from jiggle_mj.eval.paper_tables import OWN_FORCE_SD
 from jiggle_mj.eval.same_engine import FORCE_TOLERANCE, INCREMENTS, NOISE, SameEngine, same_engine, sheet
 from jiggle_mj.scenes import load_scene
 from jiggle_mj.scenes.attachments import Disc
@@ -69,7 +70,7 @@ def test_one_grasp_is_the_beginning_of_four():
 def test_our_filter_finds_the_attachments_of_its_own_engine():
     """Within one ring, with a small force error stated, as the data come from the estimator's own model."""
     found = made("equilibrium")
-    estimator = Estimator(found.declaration, config=EstimatorConfig(force_sd=5e-4))
+    estimator = Estimator(found.declaration, config=EstimatorConfig(force_sd=OWN_FORCE_SD))
     for observation in found.observations:
         estimator.update(observation)
     estimator.release()

@@ -42,7 +42,7 @@ class PointTracker:
         found = [_by_id(points) for points in still]
         if self._declared is not None:
             self.ids = self._declared.track_id
-            rest_variance = np.full(len(self.ids), still[0].sd ** 2)
+            rest_variance = np.full(len(self.ids), _rest_variance(self._declared, found, still[0].sd))
             sheet = Sheet(rest=self._declared.vertices, faces=self._declared.faces)
         else:
             times = Counter(i for frame in found for i in frame)
@@ -84,3 +84,15 @@ def _by_id(points: MeasuredPoints) -> dict[int, np.ndarray]:
         )
     seen = np.isfinite(points.positions).all(axis=1) & (points.track_id >= 0)
     return dict(zip(points.track_id[seen].tolist(), points.positions[seen], strict=True))
+
+
+def _rest_variance(mesh: DeclaredMesh, found: list[dict[int, np.ndarray]], sd: float) -> float:
+    """Of each coordinate of a declared mesh [m^2]: how far it is from the frames at rest, beyond their own noise.
+
+    A mesh that is one of these frames has that frame's noise; one that a frame shows nothing of is taken to have it.
+    """
+    unseen = np.full(3, np.nan)
+    off = np.array([[frame.get(int(i), unseen) for i in mesh.track_id] for frame in found]) - mesh.vertices
+    if (np.nansum(np.abs(off), axis=(1, 2)) == 0).any():
+        return sd**2
+    return float(np.clip(np.nanmean(off**2) - sd**2, 0, sd**2))
