@@ -27,7 +27,7 @@ REFERENCES: tuple[Reference, ...] = ("xpbd", "equilibrium", "mujoco")
 RULE = 0.5
 """b_thresh / b*, as in the paper (0.05 / 0.1)."""
 OWN_FORCE_SD = 5e-4
-"""Force that the model gets wrong, as told to all methods where the truth is an equilibrium of its own [k x spacing]."""
+"""Force that the model gets wrong, as told to all methods where the truth is its own equilibrium [k x spacing]."""
 METHODS = {
     "explicit (the paper's filter)": EstimatorConfig(filter="explicit"),
     "Adam": EstimatorConfig(filter="adam"),
