@@ -28,9 +28,14 @@ def test_a_same_engine_run_is_scored_and_not_repeated(tmp_path, monkeypatch):
 def test_the_rule_is_half_of_the_references_own_stiffness():
     """Shipped scenes attach with 1 N/m, k = 30 N/m."""
     assert CELL.config.detect_above == pytest.approx(0.005)
-    own, mujoco = (Cell(scene="arc", reference=reference, method="Adam") for reference in ("equilibrium", "mujoco"))
-    assert own.config.force_sd == OWN_FORCE_SD < mujoco.config.force_sd == CELL.config.force_sd
+    mujoco = Cell(scene="arc", reference="mujoco", method="Adam")
     assert mujoco.config.detect_above == pytest.approx(0.5 / 30) and mujoco.config.filter == "adam"
+
+
+def test_only_ours_is_told_that_its_own_engine_is_exact():
+    told = {cell for cell in cells() if cell.config.force_sd == OWN_FORCE_SD}
+    assert {(cell.reference, cell.method) for cell in told} == {("equilibrium", "implicit (ours)")}
+    assert {cell.config.force_sd for cell in cells()} == {OWN_FORCE_SD, METHODS["NNLS"].force_sd}
 
 
 def test_every_method_meets_every_shape_and_reference_once():
