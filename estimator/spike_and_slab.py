@@ -14,6 +14,8 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
 BISECTIONS = 50
+LEARNED = 0.2
+"""Part of each step that the shares take: with all of it, a particle about even tips them, and they tip it back."""
 
 
 class Mixture(eqx.Module):
@@ -80,14 +82,14 @@ class SpikeAndSlab(eqx.Module):
         )
 
     def learned(self, mixture: "Mixture") -> "SpikeAndSlab":
-        """Shares as expected after counting the particles likelier attached than not, from a Dirichlet prior.
+        """Shares moved towards those expected after counting the particles likelier attached than not.
 
-        A step of expectation maximisation; doubtful particles are left out, since hundreds of them, each a little
-        likely to be attached faintly, would talk each other into it.
+        A damped step of expectation maximisation from a Dirichlet prior; doubtful particles are left out, since
+        hundreds of them, each a little likely to be attached faintly, would talk each other into it.
         """
         count = jnp.sum(jnp.where(mixture.attached > 0.5, mixture.weight[1:], 0.0), axis=1)
         share = (self.even / len(count) + count) / (self.even + jnp.sum(count))
-        return eqx.tree_at(lambda prior: prior.share, self, share)
+        return eqx.tree_at(lambda prior: prior.share, self, (1 - LEARNED) * self.share + LEARNED * share)
 
     def posterior(
         self, mean: Float[Array, " n"], variance: Float[Array, " n"], log_odds: Float[Array, " n"]

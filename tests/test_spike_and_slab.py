@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
+from jiggle_mj.estimator.spike_and_slab import LEARNED, SpikeAndSlab
 from scipy.stats import norm
 
 SPIKE, RUNGS, SPREAD = 3e-3, (0.01, 0.1, 1.0), 0.5
@@ -59,9 +59,12 @@ def test_the_shares_are_those_of_the_particles_called_attached():
     mean = jnp.array([0.1] * 20 + [0.0, 0.0, 0.5])
     variance = jnp.array([1e-6] * 22 + [1e6])
     mixture, _ = PRIOR.posterior(mean, variance, jnp.full(23, LOG_ODDS))
-    learned = PRIOR.learned(mixture)
+    learned = once = PRIOR.learned(mixture)
+    for _ in range(100):
+        learned = learned.learned(mixture)
     on_it = np.asarray(mixture.weight[2, :20]).sum()
     assert float(learned.share[1]) == pytest.approx((1 + on_it) / 23, rel=1e-6)
     assert float(jnp.sum(learned.share)) == pytest.approx(1)
+    np.testing.assert_allclose(once.share, PRIOR.share + LEARNED * (learned.share - PRIOR.share), rtol=1e-5)
     nobody, _ = PRIOR.posterior(jnp.zeros(4), jnp.full(4, 1e-6), jnp.full(4, LOG_ODDS))
     np.testing.assert_allclose(PRIOR.learned(nobody).share, 1 / 3)
