@@ -16,12 +16,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float, Int
 from jiggle_mj.estimator.belief import entropy
 from jiggle_mj.estimator.block_tridiagonal import lower_inverse
-from jiggle_mj.estimator.mesh import neighbour_table
+from jiggle_mj.estimator.mesh import neighbour_table, symmetric
 from jiggle_mj.estimator.spike_and_slab import Mixture, SpikeAndSlab
 
 
@@ -49,8 +48,7 @@ class AttachmentPrior(eqx.Module):
         coupling: float,
     ) -> "AttachmentPrior":
         """For n particles; `probability` is that of one none of whose neighbours is attached."""
-        i, j = np.concatenate([edges, edges[:, ::-1]]).T
-        table = neighbour_table(sp.csr_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(n, n)))
+        table = neighbour_table(symmetric(n, edges))
         back = np.argmax(table[table] == np.arange(n)[:, None, None], axis=2)
         return cls(
             stiffness=stiffness,

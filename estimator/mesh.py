@@ -79,7 +79,12 @@ class SheetMesh:
 
 def pattern(n: int, pairs: Int[np.ndarray, "m 2"]) -> sp.csr_matrix:
     """Symmetric n x n boolean pattern with the given pairs and the diagonal."""
-    i, j = np.concatenate([pairs, pairs[:, ::-1], np.repeat(np.arange(n)[:, None], 2, axis=1)]).T
+    return symmetric(n, np.concatenate([pairs, np.repeat(np.arange(n)[:, None], 2, axis=1)]))
+
+
+def symmetric(n: int, pairs: Int[np.ndarray, "m 2"]) -> sp.csr_matrix:
+    """Symmetric n x n boolean pattern with the given pairs alone."""
+    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
     return sp.csr_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(n, n))
 
 

@@ -50,7 +50,6 @@ class Case:
 
     mesh: SheetMesh
     declaration: Declaration
-    energy: SheetEnergy
     gripped: SheetEnergy
     """With the jaws where they are in the last frame."""
     frames: tuple[Evidence, ...]
@@ -106,7 +105,6 @@ def case(n: int) -> Case:
     return Case(
         mesh=mesh,
         declaration=declaration,
-        energy=energy,
         gripped=gripped,
         frames=tuple(frames),
         attached=attached,

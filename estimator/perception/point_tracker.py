@@ -7,7 +7,7 @@ the nearest surface instead of the same material point loses the attachments.
 from collections import Counter
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
 
 from jiggle_mj.errors import PerceptionError
@@ -69,8 +69,7 @@ class PointTracker:
     def track(self, points: MeasuredPoints) -> Track:
         """Look the particles up in one frame; the error of the rest positions is part of the covariance."""
         found = _by_id(points)
-        unseen = np.full(3, np.nan)
-        positions = np.array([found.get(int(i), unseen) for i in self.ids])
+        positions = _positions(found, self.ids)
         visible = np.asarray(np.isfinite(positions).all(axis=1))
         variance = np.where(visible, points.sd**2 + self._rest_variance, UNSEEN_VARIANCE)
         return Track(positions=positions, covariance=variance[:, None, None] * np.eye(3), visible=visible)
@@ -86,13 +85,18 @@ def _by_id(points: MeasuredPoints) -> dict[int, np.ndarray]:
     return dict(zip(points.track_id[seen].tolist(), points.positions[seen], strict=True))
 
 
+def _positions(found: dict[int, np.ndarray], ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """Of each particle, NaN where nothing was found."""
+    unseen = np.full(3, np.nan)
+    return np.array([found.get(i, unseen) for i in ids.tolist()])
+
+
 def _rest_variance(mesh: DeclaredMesh, found: list[dict[int, np.ndarray]], sd: float) -> float:
     """Of each coordinate of a declared mesh [m^2]: how far it is from the frames at rest, beyond their own noise.
 
     A mesh that is one of these frames has that frame's noise; one that a frame shows nothing of is taken to have it.
     """
-    unseen = np.full(3, np.nan)
-    off = np.array([[frame.get(int(i), unseen) for i in mesh.track_id] for frame in found]) - mesh.vertices
+    off = np.array([_positions(frame, mesh.track_id) for frame in found]) - mesh.vertices
     if (np.nansum(np.abs(off), axis=(1, 2)) == 0).any():
         return sd**2
     return float(np.clip(np.nanmean(off**2) - sd**2, 0, sd**2))
