@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.belief import entropy
 from jiggle_mj.estimator.block_tridiagonal import lower_inverse
 from jiggle_mj.estimator.mesh import neighbour_table, symmetric
@@ -107,6 +107,25 @@ class AttachmentBelief(eqx.Module):
     def refine(self, sweeps: int) -> "AttachmentBelief":
         """Sweeps of expectation and belief propagation over all particles at once, damped."""
         return jax.lax.fori_loop(0, sweeps, lambda _, belief: belief.sweep(belief.gaussian()), self)
+
+    def converge(self, sweeps: int) -> tuple["AttachmentBelief", Bool[Array, ""]]:
+        """Sweeps until no P(attached) changes by more than `STILL` in one of them, and whether so many were enough.
+
+        They need not be: where the evidence contradicts itself, propagation may have no fixed point that it finds.
+        """
+
+        def step(state):
+            belief, before, _, count = state
+            cavity = belief._cavity(belief.gaussian())
+            attached = belief._mixture(*cavity)[0].attached
+            return belief._matched(*cavity), attached, jnp.max(jnp.abs(attached - before)), count + 1
+
+        def unfinished(state):
+            return (state[2] > STILL) & (state[3] < sweeps)
+
+        first = self, jnp.full_like(self.shift, jnp.inf), jnp.asarray(jnp.inf), jnp.asarray(0)
+        belief, _, change, _ = jax.lax.while_loop(unfinished, step, first)
+        return belief, change <= STILL
 
     def sweep(self, gaussian: "Gaussian") -> "AttachmentBelief":
         """One of them, given what `gaussian` returned."""
@@ -220,6 +239,8 @@ TAIL = 0.05
 """Probability left out at either end of an interval."""
 UNKNOWN = 1e8
 """Variance of an s of which nothing is known."""
+STILL = 1e-3
+"""Change of P(attached) in a sweep that counts as none."""
 DAMPING = 0.7
 """Share of each sweep's outcome that is taken."""
 SITE_PRECISION = (1e-2, 1e14)

@@ -66,7 +66,7 @@ class Estimator:
         self._filter: Filter | None = None
         self._hold: GripHold | None = None
         self._closing: ToolState | None = None
-        self._used = False
+        self._used, self._converged = False, True
 
     @property
     def sheet(self) -> Sheet:
@@ -108,13 +108,18 @@ class Estimator:
             ValueError: asked before the first frame with closed jaws.
         """
         self._check_begun()
+        assert self._filter is not None
         if np.isfinite(self._probability).all():
+            noise = self._filter.noise
             return Detection(
                 attached=self._probability > 0.5,
                 score=self._probability,
                 stiffness=self._b,
                 probabilistic=True,
                 rule=RULE,
+                converged=self._converged,
+                force_sd_ratio=None if noise is None else noise.force**0.5,
+                position_sd_ratio=None if noise is None else noise.position**0.5,
             )
         limit = self.config.detect_above * self.declaration.membrane_stiffness
         return Detection(
@@ -153,6 +158,7 @@ class Estimator:
         with jax.enable_x64(True), one_thread():
             if (again := self._filter.release(self._belief)) is not None:
                 self._believe(again)
+                self._converged = bool(again.converged)
 
     def _update(self, observation: Observation) -> Estimate | None:
         tool = observation.tool

@@ -90,3 +90,10 @@ class Detection:
     probabilistic: bool = False
     rule: str
     """In words, with its numbers; never depends on the scene's true stiffness."""
+    converged: bool = True
+    """Whether the belief came to rest; where it did not, the figures are those of the moment that it was cut off."""
+    force_sd_ratio: float | None = None
+    """How many times the typed standard deviation of the model's force error the observations ask for, from 1 on; None
+    where it is not learned."""
+    position_sd_ratio: float | None = None
+    """The same for the stated noise of the positions."""

@@ -4,10 +4,11 @@ BY_DILATION = {rings: dict.fromkeys(("pcd", "pug", "f1")) for rings in "012"}
 KEYS = {
     **dict.fromkeys(("scene", "seed", "sensing", "estimator", "policy", "n_particles", "n_frames")),
     "detection": {
-        **dict.fromkeys(("rule", "n_detected", "n_attached", "n_observable", "average_precision")),
+        **dict.fromkeys(("rule", "n_detected", "n_attached", "n_observable", "average_precision", "converged")),
         "by_dilation": BY_DILATION,
         "observable": {"by_dilation": BY_DILATION},
     },
+    "noise": dict.fromkeys(("force_sd_ratio", "position_sd_ratio")),
     "calibration": dict.fromkeys(("nees_per_dof", "coverage_90", "ece")),
     "tracking": {"rms_m": None},
     "safety": dict.fromkeys(("limit_j", "max_mean_boundary_energy_j", "violations")),

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.filters.noise import Noise
 
 
 class Pull(eqx.Module):
@@ -34,6 +35,11 @@ class Evidence(eqx.Module):
     """Particles that the grip may pull at, the held ones among them, whose balance of forces is unknown."""
     pull: Pull | None = None
 
+    def widened(self, variance: float) -> "Evidence":
+        """With that many times the variance of what was seen; what the grip says of held particles stays."""
+        precision = jnp.where(self.held[:, None, None], self.precision, self.precision / variance)
+        return eqx.tree_at(lambda one: one.precision, self, precision)
+
     @property
     def seen(self) -> Bool[Array, " n"]:
         """Particles of which anything is known, from sight or from the grip."""
@@ -53,6 +59,9 @@ class Stated(eqx.Module):
     """P(attached)."""
     entropy: Float[Array, ""]
     """Of the belief [nat]."""
+    converged: Bool[Array, ""]
+    """Whether what was searched (the state of a frame, the belief when the jaws open) came to an end, or was cut off;
+    true where nothing is searched."""
 
 
 class Update(Stated):
@@ -62,12 +71,13 @@ class Update(Stated):
     """State after the update [m]."""
     nis: Float[Array, ""]
     """Normalised innovation squared per degree of freedom, before the update; 1 where the stated noises are right."""
-    converged: Bool[Array, ""]
-    """Whether the search for the state came to an end, or was cut off; true where nothing is searched."""
 
 
 class Filter(ABC):
     """A way to update the belief; it may keep frames of its own for later updates."""
+
+    noise: Noise | None = None
+    """How much wider than typed the noises had to be; None where that is not learned."""
 
     @abstractmethod
     def update(self, belief: Any, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]) -> Update:

@@ -31,6 +31,7 @@ from jiggle_mj.estimator.block_tridiagonal import (
 )
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.noise import Misfit
 from jiggle_mj.estimator.filters.tethered import Tethered
 from jiggle_mj.estimator.mesh import SheetMesh, neighbour_table, pattern
 
@@ -89,6 +90,10 @@ class ForceBalance(eqx.Module):
             reference=jnp.asarray(reference, dtype=float),
             grip_stiffness=jnp.asarray(grip_stiffness, dtype=float),
         )
+
+    def widened(self, variance: float) -> "ForceBalance":
+        """With that many times the variance of the unbalanced force."""
+        return eqx.tree_at(lambda one: one.force_sd, self, self.force_sd * jnp.sqrt(variance))
 
     def settle(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
         """Equilibrium at fixed s of the sheet tethered to the observed positions, searched from x."""
@@ -153,6 +158,26 @@ class ForceBalance(eqx.Module):
         precision = jnp.diag(w * jnp.sum(slope**2, axis=1)) - square[layout.slot][:, layout.slot]
         pulled = -jnp.sum(slope * whitened, axis=1)
         return Information(precision=precision, pulled=pulled, squared=jnp.sum(residual * whitened), at=frame.s)
+
+    def misfit(self, frame: "Frame", evidence: Evidence) -> Misfit:
+        """What is left at the state that explains the frame best for the s of the linearisation."""
+        w, covariance = frame.weight, inverse_band(frame.factor)
+        residual = frame.unbalanced + self._apply(frame.rows, frame.off)
+        off = solve(self.layout, frame.factor, self._transposed(frame.rows, w[:, None] * residual))
+        force = jnp.sqrt(w)[:, None] * (residual - self._apply(frame.rows, off))
+        fitted = w * window_sums(self.layout, covariance, self.places, frame.rows)
+        free = evidence.seen & ~evidence.held
+        root = jnp.linalg.cholesky(jnp.where(free[:, None, None], evidence.precision, jnp.eye(3)))
+        root = jnp.where(free[:, None, None], jnp.swapaxes(root, 1, 2), 0.0)
+        itself = jnp.argmax(self.neighbours == jnp.arange(len(w))[:, None], axis=1)
+        itself = self.places[jnp.arange(len(w)), itself, itself]
+        seen = window_sums(self.layout, covariance, itself[:, None, None], root[:, None])
+        return Misfit(
+            force=force,
+            force_degrees=jnp.sum(jnp.where(w > 0, 3 - fitted, 0.0)),
+            position=jnp.einsum("nij,nj->ni", root, off),
+            position_degrees=jnp.sum(jnp.where(free, 3 - seen, 0.0)),
+        )
 
     def _calibrated(self, frame: "Frame") -> Float[Array, "n 3"]:
         """D, shrunk towards 0 by the share of |D|^2 that its own error makes up.

@@ -5,16 +5,15 @@ attachment shows only once its surroundings are believed stiff: when the jaws op
 what is believed now are linearised again, and replace what they said before. Nothing is counted twice.
 """
 
-from dataclasses import dataclass
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Stated, Update
 from jiggle_mj.estimator.filters.force_balance import ForceBalance, Information
+from jiggle_mj.estimator.filters.noise import Misfit, Noise
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 
@@ -24,12 +23,14 @@ RUNGS, SPREAD, EVEN = tuple(0.003 * 10 ** (i / 4) for i in range(11)), 0.5, 3.0
 """Of s where attached, from hardly felt to rigid; their relative widths; see `SpikeAndSlab.even`."""
 PROBABILITY, COUPLING = 0.04, 1.2
 """Of being attached without attached neighbours, and what each adds to the log odds: 2.7 of them make it even."""
-SWEEPS, LAST_SWEEPS = 2, 20
-"""Of the belief after a frame, and when the jaws open."""
+SWEEPS, LAST_SWEEPS = 2, 60
+"""Of the belief after a frame, and at most when the jaws open."""
 STALE = 0.1
 """A grasp is linearised again when some s has moved further than this from where it was."""
+FELT = 3e-3
+"""The same, before the noise is judged by what a grasp leaves unexplained: the softest attachment's s."""
 PASSES = 3
-"""Over stale grasps, at most, each time that the jaws open."""
+"""Over stale grasps, and over noises, at most, each time that the jaws open."""
 
 
 class ImplicitFilter(Filter):
@@ -40,16 +41,18 @@ class ImplicitFilter(Filter):
         self._balance = balance
         self._grasps: list[_Grasp] = []
         self._between = True
+        self.noise = Noise()
 
     def update(
         self, belief: AttachmentBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:
         """See `Filter.update`."""
         s = belief.bounded(b)
-        update, found = _update(self._balance, belief, s, evidence, start)
+        balance, noisy = self._balance.widened(self.noise.force), evidence.widened(self.noise.position)
+        update, found = _update(balance, belief, s, noisy, start)
         if np.isfinite(update.x).all() and np.isfinite(update.b).all():
             if self._between:
-                self._grasps.append(_Grasp(frames=[], precision=jnp.zeros_like(found.precision), shift=0 * s))
+                self._grasps.append(_Grasp())
             self._grasps[-1].take(evidence, update.x, found)
             self._between = False
         return update
@@ -59,17 +62,30 @@ class ImplicitFilter(Filter):
         if self._between:
             return None
         self._between = True
-        stated = _refined(belief)
+        stated = self._settled(_refined(belief), STALE)
         for _ in range(PASSES):
-            s = belief.bounded(stated.b)
-            stale = [grasp for grasp in self._grasps if grasp.distance(s) > STALE]
+            if self._learned() == self.noise:
+                break
+            stated = self._settled(stated, FELT)
+            self.noise = self._learned()
+            stated = self._settled(stated, STALE)
+        return stated
+
+    def _settled(self, stated: Stated, far: float) -> Stated:
+        """After grasps that were linearised further than `far` from what is believed were linearised again."""
+        for _ in range(PASSES):
+            s = stated.belief.bounded(stated.b)
+            stale = [grasp for grasp in self._grasps if grasp.noise != self.noise or grasp.distance(s) > far]
             if not stale:
                 break
             for grasp in stale:
-                grasp.again(self._balance, s)
+                grasp.again(self._balance, s, self.noise)
             total = sum(grasp.precision for grasp in self._grasps), sum(grasp.shift for grasp in self._grasps)
             stated = _refined(eqx.tree_at(lambda one: (one.precision, one.shift), stated.belief, total))
         return stated
+
+    def _learned(self) -> Noise:
+        return self.noise.learned([grasp.misfit for grasp in self._grasps if grasp.misfit is not None])
 
 
 def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
@@ -79,30 +95,36 @@ def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
     return AttachmentBelief.before(prior, reference=reference)
 
 
-@dataclass
 class _Grasp:
     """The frames between closing and opening the jaws, and what they say together."""
 
-    frames: list[tuple[Evidence, Float[Array, "n 3"], Float[Array, " n"]]]
-    """What was seen, the state, and the s of the linearisation."""
-    precision: Float[Array, "n n"]
-    shift: Float[Array, " n"]
+    def __init__(self) -> None:
+        self.precision: Float[Array, "n n"] | float = 0.0
+        self.shift: Float[Array, " n"] | float = 0.0
+        self.misfit: Misfit | None = None
+        """What they leave unexplained, once they were linearised again."""
+        self.noise: Noise | None = None
+        """That it was linearised again for."""
+        self._frames: list[tuple[Evidence, Float[Array, "n 3"], Float[Array, " n"]]] = []
+        """What was seen, the state, and the s of the linearisation."""
 
     def take(self, evidence: Evidence, x: Float[Array, "n 3"], found: Information) -> None:
-        self.frames.append((evidence, x, found.at))
+        self._frames.append((evidence, x, found.at))
         self.precision, self.shift = self.precision + found.precision, self.shift + found.shift
 
     def distance(self, s: Float[Array, " n"]) -> float:
         """How far s is from where a frame was linearised."""
-        return max(float(jnp.max(jnp.abs(s - at))) for _, _, at in self.frames)
+        return max(float(jnp.max(jnp.abs(s - at))) for _, _, at in self._frames)
 
-    def again(self, balance: ForceBalance, s: Float[Array, " n"]) -> None:
+    def again(self, balance: ForceBalance, s: Float[Array, " n"], noise: Noise) -> None:
         """Linearise all frames at s."""
-        frames, self.frames = self.frames, []
-        self.precision, self.shift = jnp.zeros_like(self.precision), jnp.zeros_like(self.shift)
+        frames, self._frames = self._frames, []
+        self.precision, self.shift, self.misfit, self.noise = 0.0, 0.0, None, noise
         for evidence, x, _ in frames:
-            x, found = _information(balance, x, s, evidence)
+            noisy = evidence.widened(noise.position)
+            x, found, misfit = _information(balance.widened(noise.force), x, s, noisy)
             self.take(evidence, x, found)
+            self.misfit = misfit if self.misfit is None else self.misfit + misfit
 
 
 @eqx.filter_jit
@@ -119,28 +141,29 @@ def _update(
     gaussian = belief.gaussian()
     nis = _normalised_innovation(found, gaussian.factor, evidence)
     belief = belief.sweep(gaussian).refine(SWEEPS - 1)
-    stated = _stated(belief)
+    stated = _stated(belief, frame.converged)
     x = balance.polish(frame, belief.bounded(stated.b), evidence)
-    return Update(**vars(stated), x=x, nis=nis, converged=frame.converged), found
+    return Update(**vars(stated), x=x, nis=nis), found
 
 
 @eqx.filter_jit
 def _information(
     balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
-) -> tuple[Float[Array, "n 3"], Information]:
+) -> tuple[Float[Array, "n 3"], Information, Misfit]:
     frame = balance.approach(x, s, evidence)
-    return frame.x, balance.information(frame)
+    return frame.x, balance.information(frame), balance.misfit(frame, evidence)
 
 
 @eqx.filter_jit
 def _refined(belief: AttachmentBelief) -> Stated:
-    return _stated(belief.refine(LAST_SWEEPS))
+    return _stated(*belief.converge(LAST_SWEEPS))
 
 
-def _stated(belief: AttachmentBelief) -> Stated:
+def _stated(belief: AttachmentBelief, converged: Bool[Array, ""]) -> Stated:
     posterior = belief.posterior()
     return Stated(
         belief=belief,
+        converged=converged,
         b=posterior.stiffness,
         sd=posterior.stiffness_sd,
         probability=posterior.attached,

@@ -1,0 +1,102 @@
+"""Noise learned from what is left unexplained: kept where it is right, widened where it is not."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.filters.evidence import Stated
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.estimator.filters.noise import Misfit, Noise
+from small_sheet import NOISE, STIFFNESS, attached, lifts, observed, sheet, sheet_balance, sheet_prior
+
+FORCE_SD = 1e-3
+DRAWS = 60
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[Misfit]:
+    """Of frames whose errors are drawn from the model, linear around a lifted state with half of s rigid."""
+    balance, truth = sheet_balance(FORCE_SD), lifts()[3]
+    seen, s = observed(truth, 0), jnp.asarray(0.5 * attached())
+    frame = balance.linearise(jnp.asarray(truth.x), s, seen)
+
+    @eqx.filter_jit
+    def misfit(balance: ForceBalance, draw: jax.Array) -> Misfit:
+        own, others = jax.random.normal(draw, (2, *frame.x.shape))
+        sd = jnp.where(frame.weight > 0, 1 / jnp.sqrt(frame.weight), 0.0)
+        seen_sd = 1 / jnp.sqrt(seen.precision[:, 0, 0])
+        parts = sd[:, None] * own, seen_sd[:, None] * others
+        return balance.misfit(eqx.tree_at(lambda one: (one.unbalanced, one.off), frame, parts), seen)
+
+    return [misfit(balance, key) for key in jax.random.split(jax.random.key(0), DRAWS)]
+
+
+def test_squares_equal_the_degrees_of_freedom_where_the_noise_is_right(drawn):
+    """Forces and positions apart, over single frames and over sums of them; four standard errors."""
+    for name in ("force", "position"):
+        ratio = [float(jnp.sum(getattr(one, name) ** 2) / getattr(one, f"{name}_degrees")) for one in drawn]
+        assert np.mean(ratio) == pytest.approx(1, abs=4 * np.std(ratio) / np.sqrt(DRAWS)), name
+        assert np.std(ratio) < 0.3, name
+    together = sum(drawn[1:], drawn[0])
+    assert float(jnp.sum(together.force**2) / together.force_degrees) == pytest.approx(1, abs=0.3)
+    assert Noise().learned(drawn) == Noise()
+
+
+def test_an_error_that_persists_counts_by_its_sum(drawn):
+    """Ten frames with one and the same error are worth one of them, not ten."""
+    persistent = sum([drawn[0]] * 9, drawn[0])
+    single = float(jnp.sum(drawn[0].force ** 2) / drawn[0].force_degrees)
+    assert Noise().learned([persistent]).force == pytest.approx(10 * single)
+
+
+def test_noise_is_never_narrower_than_typed_and_keeps_still_about_right(drawn):
+    tenth = 0.1 * drawn[0].force, 0.1 * drawn[0].position
+    small = eqx.tree_at(lambda one: (one.force, one.position), drawn[0], tenth)
+    assert Noise().learned([small]) == Noise()
+    assert Noise(force=4.0, position=9.0).learned([small]) == Noise()
+    assert Noise(force=4.0, position=9.0).learned(drawn) == Noise(force=4.0, position=9.0)
+
+
+@pytest.mark.parametrize("times", [1, 4])
+def test_the_filter_finds_how_noisy_positions_are(times):
+    noise, stated = run(times)
+    assert stated.converged
+    assert noise.position == pytest.approx(times**2, rel=0.2)
+
+
+def test_positions_noisier_than_stated_do_not_make_the_filter_sure_of_what_is_not_there(monkeypatch):
+    """It misses what it can no longer see; without learning it reports free particles too, and is surer of all."""
+    _, learned = run(4)
+    monkeypatch.setattr(Noise, "learned", lambda noise, _: noise)
+    _, typed = run(4)
+    wrong = [int((found(one) & ~attached()).sum()) for one in (learned, typed)]
+    assert wrong[0] == 0 < wrong[1]
+    assert nees(learned) < 0.01 * nees(typed)
+
+
+def run(times: float) -> tuple[Noise, Stated]:
+    """All lifts, with that many times the stated noise."""
+    filter, belief, b, grasp = ImplicitFilter(sheet_balance(1e-4)), sheet_prior(), jnp.zeros(sheet().n), 1
+    rng = np.random.default_rng(1)
+    for frame in lifts():
+        if frame.grasp != grasp:
+            stated = filter.release(belief)
+            belief, b, grasp = stated.belief, stated.b, frame.grasp
+        noisy = frame.x + times * NOISE * rng.normal(size=frame.x.shape)
+        seen = eqx.tree_at(lambda one: one.y, observed(frame, 0), jnp.asarray(noisy))
+        update = filter.update(belief, b, seen, seen.y)
+        belief, b = update.belief, update.b
+    return filter.noise, filter.release(belief)
+
+
+def found(stated: Stated) -> np.ndarray:
+    return np.asarray(stated.probability) > 0.5
+
+
+def nees(stated: Stated) -> float:
+    """Per degree of freedom of s."""
+    mean, covariance = (np.asarray(part) for part in stated.belief.moments())
+    error = mean - np.asarray(stated.belief.bounded(jnp.asarray(STIFFNESS * attached())))
+    return float(error @ np.linalg.solve(covariance, error) / len(error))
