@@ -174,18 +174,21 @@ class AttachmentBelief(eqx.Module):
         precision = jnp.maximum(1 / gaussian.variance - self.site_precision, 1 / UNKNOWN)
         return (gaussian.mean / gaussian.variance - self.site_shift) / precision, 1 / precision
 
-    def _mixture(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> tuple[Mixture, Float[Array, "n d"]]:
-        """Each particle's own distribution, and the log odds to tell each neighbour of: all but what it told."""
-        odds = self.prior.log_odds + jnp.sum(self.message, axis=1)
-        mixture, factor = self.prior.stiffness.posterior(mean, variance, odds)
-        return mixture, (odds + factor)[:, None] - self.message
+    def _mixture(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> tuple[Mixture, Float[Array, " n"]]:
+        """Each particle's own distribution, and the log Bayes factor of its being attached, neighbours left out."""
+        return self.prior.stiffness.posterior(mean, variance, self.prior.log_odds + jnp.sum(self.message, axis=1))
 
     def _matched(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> "AttachmentBelief":
-        """Sites that give each particle its own distribution's moments; messages passed and shares learned, once."""
-        mixture, told = self._mixture(mean, variance)
+        """Sites that give each particle its own distribution's moments; messages passed and shares learned, once.
+
+        Each neighbour is told of the odds by all but what it told itself.
+        """
+        mixture, factor = self._mixture(mean, variance)
         own_mean, own_variance = mixture.moments()
         precision = jnp.clip(1 / own_variance - 1 / variance, *SITE_PRECISION)
         shift = own_mean * (precision + 1 / variance) - mean / variance
+        odds = self.prior.log_odds + factor + jnp.sum(self.message, axis=1)
+        told = odds[:, None] - self.message
         sent = jnp.log1p(jax.nn.sigmoid(told) * jnp.expm1(self.prior.coupling))
         sent = jnp.concatenate([sent, jnp.zeros((1, sent.shape[1]), sent.dtype)])
         message = sent[self.prior.neighbours, self.prior.back]
@@ -200,7 +203,7 @@ class AttachmentBelief(eqx.Module):
                 damped(self.site_precision, precision),
                 damped(self.site_shift, shift),
                 damped(self.message, message),
-                self.prior.stiffness.learned(mixture),
+                self.prior.stiffness.learned(mixture, factor),
             ),
         )
 

@@ -81,13 +81,15 @@ class SpikeAndSlab(eqx.Module):
             even=jnp.asarray(even, dtype=float),
         )
 
-    def learned(self, mixture: "Mixture") -> "SpikeAndSlab":
+    def learned(self, mixture: "Mixture", factor: Float[Array, " n"]) -> "SpikeAndSlab":
         """Shares moved towards those expected after counting the particles likelier attached than not.
 
-        A damped step of expectation maximisation from a Dirichlet prior; doubtful particles are left out, since
-        hundreds of them, each a little likely to be attached faintly, would talk each other into it.
+        A damped step of expectation maximisation from a Dirichlet prior. Left out are doubtful particles, and those
+        that only their neighbours speak for, not what was measured (`factor`, log Bayes factors): hundreds of them,
+        each as well explained by a faint attachment as by none, would talk each other into it.
         """
-        count = jnp.sum(jnp.where(mixture.attached > 0.5, mixture.weight[1:], 0.0), axis=1)
+        counted = (mixture.attached > 0.5) & (factor > 0)
+        count = jnp.sum(jnp.where(counted, mixture.weight[1:], 0.0), axis=1)
         share = (self.even / len(count) + count) / (self.even + jnp.sum(count))
         return eqx.tree_at(lambda prior: prior.share, self, (1 - LEARNED) * self.share + LEARNED * share)
 

@@ -1,10 +1,14 @@
 """Noise learned from what is left unexplained: kept where it is right, widened where it is not."""
 
+from functools import reduce
+from operator import add
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.filters.evidence import Stated
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
@@ -39,14 +43,14 @@ def test_squares_equal_the_degrees_of_freedom_where_the_noise_is_right(drawn):
         ratio = [float(jnp.sum(getattr(one, name) ** 2) / getattr(one, f"{name}_degrees")) for one in drawn]
         assert np.mean(ratio) == pytest.approx(1, abs=4 * np.std(ratio) / np.sqrt(DRAWS)), name
         assert np.std(ratio) < 0.3, name
-    together = sum(drawn[1:], drawn[0])
+    together = reduce(add, drawn)
     assert float(jnp.sum(together.force**2) / together.force_degrees) == pytest.approx(1, abs=0.3)
     assert Noise().learned(drawn) == Noise()
 
 
 def test_an_error_that_persists_counts_by_its_sum(drawn):
     """Ten frames with one and the same error are worth one of them, not ten."""
-    persistent = sum([drawn[0]] * 9, drawn[0])
+    persistent = reduce(add, [drawn[0]] * 10)
     single = float(jnp.sum(drawn[0].force ** 2) / drawn[0].force_degrees)
     assert Noise().learned([persistent]).force == pytest.approx(10 * single)
 
@@ -83,12 +87,15 @@ def run(times: float) -> tuple[Noise, Stated]:
     for frame in lifts():
         if frame.grasp != grasp:
             stated = filter.release(belief)
+            assert stated is not None
             belief, b, grasp = stated.belief, stated.b, frame.grasp
         noisy = frame.x + times * NOISE * rng.normal(size=frame.x.shape)
         seen = eqx.tree_at(lambda one: one.y, observed(frame, 0), jnp.asarray(noisy))
         update = filter.update(belief, b, seen, seen.y)
         belief, b = update.belief, update.b
-    return filter.noise, filter.release(belief)
+    stated = filter.release(belief)
+    assert stated is not None
+    return filter.noise, stated
 
 
 def found(stated: Stated) -> np.ndarray:
@@ -97,6 +104,8 @@ def found(stated: Stated) -> np.ndarray:
 
 def nees(stated: Stated) -> float:
     """Per degree of freedom of s."""
-    mean, covariance = (np.asarray(part) for part in stated.belief.moments())
-    error = mean - np.asarray(stated.belief.bounded(jnp.asarray(STIFFNESS * attached())))
+    belief = stated.belief
+    assert isinstance(belief, AttachmentBelief)
+    mean, covariance = (np.asarray(part) for part in belief.moments())
+    error = mean - np.asarray(belief.bounded(jnp.asarray(STIFFNESS * attached())))
     return float(error @ np.linalg.solve(covariance, error) / len(error))

@@ -55,16 +55,19 @@ def test_far_out_in_the_tails_nothing_overflows():
 
 
 def test_the_shares_are_those_of_the_particles_called_attached():
-    """Twenty on one rung, measured well; two free ones, and one of which nothing is known, count nothing."""
-    mean = jnp.array([0.1] * 20 + [0.0, 0.0, 0.5])
-    variance = jnp.array([1e-6] * 22 + [1e6])
-    mixture, _ = PRIOR.posterior(mean, variance, jnp.full(23, LOG_ODDS))
-    learned = once = PRIOR.learned(mixture)
+    """Twenty on one rung, measured well; two free ones, one of which nothing is known, and two that are only called
+    attached because their neighbours are, count nothing."""
+    mean = jnp.array([0.1] * 20 + [0.0, 0.0, 0.5, 0.0, 0.0])
+    variance = jnp.array([1e-6] * 22 + [1e6, 1e-6, 1e-6])
+    odds = jnp.array([LOG_ODDS] * 23 + [20.0, 20.0])
+    mixture, factor = PRIOR.posterior(mean, variance, odds)
+    assert (mixture.attached[-2:] > 0.5).all()
+    learned = once = PRIOR.learned(mixture, factor)
     for _ in range(100):
-        learned = learned.learned(mixture)
+        learned = learned.learned(mixture, factor)
     on_it = np.asarray(mixture.weight[2, :20]).sum()
     assert float(learned.share[1]) == pytest.approx((1 + on_it) / 23, rel=1e-6)
     assert float(jnp.sum(learned.share)) == pytest.approx(1)
     np.testing.assert_allclose(once.share, PRIOR.share + LEARNED * (learned.share - PRIOR.share), rtol=1e-5)
-    nobody, _ = PRIOR.posterior(jnp.zeros(4), jnp.full(4, 1e-6), jnp.full(4, LOG_ODDS))
-    np.testing.assert_allclose(PRIOR.learned(nobody).share, 1 / 3)
+    nobody, factor = PRIOR.posterior(jnp.zeros(4), jnp.full(4, 1e-6), jnp.full(4, LOG_ODDS))
+    np.testing.assert_allclose(PRIOR.learned(nobody, factor).share, 1 / 3)

@@ -76,8 +76,10 @@ class Update(Stated):
 class Filter(ABC):
     """A way to update the belief; it may keep frames of its own for later updates."""
 
-    noise: Noise | None = None
-    """How much wider than typed the noises had to be; None where that is not learned."""
+    @property
+    def noise(self) -> Noise | None:
+        """How much wider than typed the noises had to be; None where that is not learned."""
+        return None
 
     @abstractmethod
     def update(self, belief: Any, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]) -> Update:

@@ -41,14 +41,19 @@ class ImplicitFilter(Filter):
         self._balance = balance
         self._grasps: list[_Grasp] = []
         self._between = True
-        self.noise = Noise()
+        self._noise = Noise()
+
+    @property
+    def noise(self) -> Noise:
+        """See `Filter.noise`."""
+        return self._noise
 
     def update(
         self, belief: AttachmentBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:
         """See `Filter.update`."""
         s = belief.bounded(b)
-        balance, noisy = self._balance.widened(self.noise.force), evidence.widened(self.noise.position)
+        balance, noisy = self._balance.widened(self._noise.force), evidence.widened(self._noise.position)
         update, found = _update(balance, belief, s, noisy, start)
         if np.isfinite(update.x).all() and np.isfinite(update.b).all():
             if self._between:
@@ -64,28 +69,30 @@ class ImplicitFilter(Filter):
         self._between = True
         stated = self._settled(_refined(belief), STALE)
         for _ in range(PASSES):
-            if self._learned() == self.noise:
+            if self._learned() == self._noise:
                 break
             stated = self._settled(stated, FELT)
-            self.noise = self._learned()
+            self._noise = self._learned()
             stated = self._settled(stated, STALE)
         return stated
 
     def _settled(self, stated: Stated, far: float) -> Stated:
         """After grasps that were linearised further than `far` from what is believed were linearised again."""
         for _ in range(PASSES):
-            s = stated.belief.bounded(stated.b)
-            stale = [grasp for grasp in self._grasps if grasp.noise != self.noise or grasp.distance(s) > far]
+            belief = stated.belief
+            assert isinstance(belief, AttachmentBelief)
+            s = belief.bounded(stated.b)
+            stale = [grasp for grasp in self._grasps if grasp.noise != self._noise or grasp.distance(s) > far]
             if not stale:
                 break
             for grasp in stale:
-                grasp.again(self._balance, s, self.noise)
+                grasp.again(self._balance, s, self._noise)
             total = sum(grasp.precision for grasp in self._grasps), sum(grasp.shift for grasp in self._grasps)
-            stated = _refined(eqx.tree_at(lambda one: (one.precision, one.shift), stated.belief, total))
+            stated = _refined(eqx.tree_at(lambda one: (one.precision, one.shift), belief, total))
         return stated
 
     def _learned(self) -> Noise:
-        return self.noise.learned([grasp.misfit for grasp in self._grasps if grasp.misfit is not None])
+        return self._noise.learned([grasp.misfit for grasp in self._grasps if grasp.misfit is not None])
 
 
 def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
