@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jiggle_mj.eval.carrying import CarriedTruth, carry, frame_at, stiffness_at
@@ -18,7 +19,7 @@ from jiggle_mj.eval.flat_map import grid_of, outline, plane_of, spacing
 from jiggle_mj.eval.metrics import DILATIONS, GATE_VARIANCE, agreement, distances
 from jiggle_mj.eval.pictures import pictures, state_of
 from jiggle_mj.eval.tracking import tracking
-from jiggle_mj.eval.verdict import against_truth, found, stiffness_sums
+from jiggle_mj.eval.verdict import against_truth, doubts, found, stiffness_sums
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
@@ -45,7 +46,7 @@ def write_report(
     estimates: Sequence[Estimate],
     belief: Belief,
     detection: Detection,
-    result: Mapping[str, object],
+    result: Mapping[str, Any],
     settings: Mapping[str, object],
     truth: Truth | None = None,
     images: Callable[[int], StereoPair | None] | None = None,
@@ -99,6 +100,7 @@ def write_report(
     if truth is not None and carried is not None:
         beside = _beside(sheet, estimates, belief, detection, truth, carried)
         sentences += [against_truth(sheet, detection, carried), stiffness_sums(sheet, belief, detection, carried)]
+    sentences += doubts(result)
     text = page.from_string((here / "report.html").read_text("utf-8")).render(
         result=result,
         sentences=sentences,

@@ -1,5 +1,8 @@
 """What was found, in one or two sentences for people."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from jiggle_mj.eval.carrying import CarriedTruth
 from jiggle_mj.eval.flat_map import Plane
@@ -7,6 +10,8 @@ from jiggle_mj.eval.metrics import dilate, patches
 
 from jiggle_mj.estimate import Belief, Detection, Sheet
 
+POOR_FIT = 1.5
+"""A noise that is wider by more than this is worth a word."""
 NAMED_PATCHES = 3
 """Patches whose place is spelled out; the others are counted."""
 
@@ -56,6 +61,18 @@ def stiffness_sums(sheet: Sheet, belief: Belief, detection: Detection, carried: 
     stated = f"a stated standard deviation of {sd:.1f}" if np.isfinite(sd) else "no stated deviation"
     total, true = detection.stiffness[near].sum(), carried.stiffness[near].sum()
     return f"Over these and one ring around them b sums to {total:.1f} N/m, with {stated}; the truth is {true:.1f}."
+
+
+def doubts(figures: Mapping[str, Any]) -> list[str]:
+    """Why to trust what was found less, from `result.json`; of a version that did not say, nothing."""
+    said = []
+    if not figures["detection"].get("converged", True):
+        said.append("The belief did not come to rest: its probabilities depend on when it was cut off.")
+    noise = figures.get("noise", {})
+    for name, what in (("force_sd_ratio", "The model's forces"), ("position_sd_ratio", "The positions")):
+        if (ratio := noise.get(name)) is not None and ratio > POOR_FIT:
+            said.append(f"{what} are off by {ratio:.1f} times what was stated, and were trusted that much less.")
+    return said
 
 
 def _integer(value: float) -> str:

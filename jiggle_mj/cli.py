@@ -306,12 +306,10 @@ def _progress(total: int, title: str) -> "Iterator[OnFrame]":
         yield on_frame
 
 
-POOR_FIT = 1.5
-"""Noise that is wider by more than this is worth a word."""
-
-
 def _show(figures: dict, out: Path, as_json: bool) -> None:
     """What was found, in a few lines; the whole of it with --json."""
+    from jiggle_mj.eval.verdict import doubts
+
     detection, calibration = figures["detection"], figures["calibration"]
     console.print(
         f"{detection['n_detected']} of {figures['n_particles']} particles reported attached ({detection['rule']})"
@@ -333,11 +331,8 @@ def _show(figures: dict, out: Path, as_json: bool) -> None:
         console.print(f"frame {skipped['index']} skipped: {skipped['why']}")
     for index in figures["frames"]["not_converged"]:
         console.print(f"frame {index}: the search for the sheet's state was cut off; trust it less.")
-    if not detection["converged"]:
-        console.print("the belief did not come to rest: the probabilities depend on when it was cut off.")
-    for name, of in (("force_sd_ratio", "the model's forces"), ("position_sd_ratio", "the positions")):
-        if (ratio := figures["noise"][name]) is not None and ratio > POOR_FIT:
-            console.print(f"{of} are off by {ratio:.1f} times what was stated, and were trusted that much less.")
+    for doubt in doubts(figures):
+        console.print(doubt)
     console.print(f"report: {out / 'report.html'}")
     if as_json:
         print(json.dumps(figures))

@@ -1,5 +1,6 @@
 """The page: whole without any part of its input, deterministic, closed to the network, and right in a real browser."""
 
+import dataclasses
 import re
 import shutil
 import subprocess
@@ -15,7 +16,7 @@ from jiggle_mj.eval.flat_map import grid_of, outline, plane_of
 from jiggle_mj.eval.pictures import pictures
 from jiggle_mj.eval.report import write_report
 from jiggle_mj.eval.score import result, with_truth
-from jiggle_mj.eval.verdict import against_truth, found, stiffness_sums
+from jiggle_mj.eval.verdict import against_truth, doubts, found, stiffness_sums
 from scipy.spatial import Delaunay
 
 from jiggle_mj.camera import StereoCamera
@@ -190,6 +191,20 @@ def test_each_combination_shows_what_it_has_and_nothing_else(tmp_path, truth, im
     assert "the right image is missing" in page
     assert "known relative to the declared membrane stiffness" in page
     assert "declaration.membrane_stiffness" in page
+
+
+def test_doubts_are_told_where_there_are_any(tmp_path):
+    good = {"detection": {"converged": True}, "noise": {"force_sd_ratio": 1.4, "position_sd_ratio": None}}
+    bad = {"detection": {"converged": False}, "noise": {"force_sd_ratio": 12.04, "position_sd_ratio": 1.2}}
+    assert doubts(good) == doubts({"detection": {}}) == []
+    rest, forces = doubts(bad)
+    assert "did not come to rest" in rest and "forces are off by 12.0 times" in forces
+    run = synthetic()
+    parts = {name: run[name] for name in ("sheet", "estimates", "belief")}
+    poor = dataclasses.replace(run["detection"], converged=False)
+    figures = run["unscored"] | {"detection": run["unscored"]["detection"] | {"converged": False}}
+    write_report(tmp_path / "report.html", **parts, detection=poor, result=figures, settings=SETTINGS)
+    assert rest in own_markup((tmp_path / "report.html").read_text("utf-8"))
 
 
 def test_the_page_asks_nothing_of_the_network_and_stays_small(tmp_path):
