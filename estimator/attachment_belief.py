@@ -169,6 +169,11 @@ class AttachmentBelief(eqx.Module):
         mean = inverse.T @ (inverse @ (self.shift + self.site_shift))
         return Gaussian(factor=factor, mean=mean, variance=jnp.sum(inverse**2, axis=0))
 
+    @property
+    def _odds(self) -> Float[Array, " n"]:
+        """Log odds of being attached, by the prior and what the neighbours told."""
+        return self.prior.log_odds + jnp.sum(self.message, axis=1)
+
     def _cavity(self, gaussian: "Gaussian") -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """Mean and variance of each particle's s without its own site."""
         precision = jnp.maximum(1 / gaussian.variance - self.site_precision, 1 / UNKNOWN)
@@ -176,7 +181,7 @@ class AttachmentBelief(eqx.Module):
 
     def _mixture(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> tuple[Mixture, Float[Array, " n"]]:
         """Each particle's own distribution, and the log Bayes factor of its being attached, neighbours left out."""
-        return self.prior.stiffness.posterior(mean, variance, self.prior.log_odds + jnp.sum(self.message, axis=1))
+        return self.prior.stiffness.posterior(mean, variance, self._odds)
 
     def _matched(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> "AttachmentBelief":
         """Sites that give each particle its own distribution's moments; messages passed and shares learned, once.
@@ -187,8 +192,7 @@ class AttachmentBelief(eqx.Module):
         own_mean, own_variance = mixture.moments()
         precision = jnp.clip(1 / own_variance - 1 / variance, *SITE_PRECISION)
         shift = own_mean * (precision + 1 / variance) - mean / variance
-        odds = self.prior.log_odds + factor + jnp.sum(self.message, axis=1)
-        told = odds[:, None] - self.message
+        told = (self._odds + factor)[:, None] - self.message
         sent = jnp.log1p(jax.nn.sigmoid(told) * jnp.expm1(self.prior.coupling))
         sent = jnp.concatenate([sent, jnp.zeros((1, sent.shape[1]), sent.dtype)])
         message = sent[self.prior.neighbours, self.prior.back]

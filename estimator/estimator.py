@@ -66,7 +66,8 @@ class Estimator:
         self._filter: Filter | None = None
         self._hold: GripHold | None = None
         self._closing: ToolState | None = None
-        self._used, self._converged = False, True
+        self._used = False
+        self._converged = True
 
     @property
     def sheet(self) -> Sheet:

@@ -5,6 +5,7 @@ shapes meet they must agree on the stiffness, because a vertex has one.
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -24,7 +25,7 @@ def _distance_to_segment(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attachment(Section):
+class Attachment(Section, ABC):
     """A shape with a width and a stiffness; the subclasses say which shape."""
 
     section: ClassVar[str] = "attachments"
@@ -34,11 +35,11 @@ class Attachment(Section):
     @property
     def half_width(self) -> float:
         """Vertices up to this distance from the shape are attached [m]."""
-        return 0.5 * getattr(self, "width")  # noqa: B009
+        return 0.5 * getattr(self, "width")  # noqa: B009  # each shape has one, with a range of its own
 
+    @abstractmethod
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """From points in tissue coordinates to the shape [m]."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,9 +11,9 @@ from jiggle_mj.estimator.block_tridiagonal import BlockTridiagonal, Layout
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
-from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.evidence import Evidence, Stated, Update
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
-from jiggle_mj.estimator.filters.implicit import prior_belief
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.surrogate import surrogate
 from jiggle_mj.eval import benchmark
@@ -133,6 +133,28 @@ def lifts(stiffness: float = STIFFNESS) -> tuple[Lift, ...]:
             x = np.asarray(found.x)
             frames.append(Lift(x=x, tip=tip, held=held, grasp=grasp))
     return tuple(frames)
+
+
+def follow(filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence]) -> tuple[Update, Stated]:
+    """All frames, the jaws opening after each lift; the last update, and what is stated at the end."""
+    belief, b, grasp, update = sheet_prior(), jnp.zeros(sheet().n), 1, None
+    for frame, one in zip(frames, seen, strict=True):
+        if frame.grasp != grasp:
+            stated = filter.release(belief)
+            assert stated is not None
+            belief, b, grasp = stated.belief, stated.b, frame.grasp
+        update = filter.update(belief, b, one, one.y)
+        belief, b = update.belief, update.b
+    stated = filter.release(belief)
+    assert update is not None and stated is not None
+    return update, stated
+
+
+def nees(belief: AttachmentBelief) -> float:
+    """Squared error of s in units of the stated covariance, per degree of freedom, where attached means `STIFFNESS`."""
+    mean, covariance = (np.asarray(part) for part in belief.moments())
+    error = mean - np.asarray(belief.bounded(jnp.asarray(STIFFNESS * attached())))
+    return float(error @ np.linalg.solve(covariance, error) / len(error))
 
 
 def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:

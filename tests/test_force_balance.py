@@ -17,7 +17,8 @@ N = sheet().n
 
 @eqx.filter_jit
 def information(balance: ForceBalance, x, s, evidence: Evidence):
-    return balance.information(balance.linearise(x, s, evidence))
+    frame = balance.linearise(x, s, evidence)
+    return balance.information(frame, balance.fit(frame))
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.block_tridiagonal import (
     BlockCholesky,
+    BlockTridiagonal,
     Layout,
     add_to_diagonal,
     assemble,
@@ -48,6 +49,9 @@ class ForceBalance(eqx.Module):
     layout: Layout
     """Twice the energy's band: the pattern of H^T H."""
     places: Int[Array, "n p p"]
+    """Where the windows of each particle and its neighbours lie in the layout."""
+    own_place: Int[Array, "n 1 1"]
+    """Where each particle's own window lies."""
     force_sd: Float[Array, ""]
     """tau [N]."""
     anchor_sd: Float[Array, ""]
@@ -85,6 +89,7 @@ class ForceBalance(eqx.Module):
             slots=slots,
             layout=layout,
             places=jnp.asarray(layout.pair_index(neighbours)),
+            own_place=jnp.asarray(layout.pair_index(np.arange(mesh.n)[:, None])),
             force_sd=jnp.asarray(force_sd, dtype=float),
             anchor_sd=jnp.asarray(anchor_sd, dtype=float),
             reference=jnp.asarray(reference, dtype=float),
@@ -144,12 +149,22 @@ class ForceBalance(eqx.Module):
             off=jnp.where(evidence.seen[:, None], evidence.y - x, 0.0),
         )
 
-    def information(self, frame: "Frame") -> "Information":
-        """What the frame says of s, with its state eliminated."""
-        layout, w, slope = self.layout, frame.weight, self._calibrated(frame)
+    def fit(self, frame: "Frame") -> "Fit":
+        """The state that explains a frame best, for the s of its linearisation."""
         residual = frame.unbalanced + self._apply(frame.rows, frame.off)
-        back = solve(layout, frame.factor, self._transposed(frame.rows, w[:, None] * residual))
-        whitened = w[:, None] * (residual - self._apply(frame.rows, back))
+        pushed = self._transposed(frame.rows, frame.weight[:, None] * residual)
+        off = solve(self.layout, frame.factor, pushed)
+        return Fit(
+            residual=residual,
+            left=residual - self._apply(frame.rows, off),
+            off=off,
+            covariance=inverse_band(frame.factor),
+        )
+
+    def information(self, frame: "Frame", fit: "Fit") -> "Information":
+        """What the frame says of s, with its state eliminated."""
+        layout, w, slope = self.layout, frame.weight, self._calibrated(frame, fit)
+        whitened = w[:, None] * fit.left
         spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, slope)
         padded = layout.n_blocks * layout.width
         slot = jnp.append(layout.slot, padded)[self.neighbours]
@@ -157,36 +172,30 @@ class ForceBalance(eqx.Module):
         square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
         precision = jnp.diag(w * jnp.sum(slope**2, axis=1)) - square[layout.slot][:, layout.slot]
         pulled = -jnp.sum(slope * whitened, axis=1)
-        return Information(precision=precision, pulled=pulled, squared=jnp.sum(residual * whitened), at=frame.s)
+        return Information(precision=precision, pulled=pulled, squared=jnp.sum(fit.residual * whitened), at=frame.s)
 
-    def misfit(self, frame: "Frame", evidence: Evidence) -> Misfit:
-        """What is left at the state that explains the frame best for the s of the linearisation."""
-        w, covariance = frame.weight, inverse_band(frame.factor)
-        residual = frame.unbalanced + self._apply(frame.rows, frame.off)
-        off = solve(self.layout, frame.factor, self._transposed(frame.rows, w[:, None] * residual))
-        force = jnp.sqrt(w)[:, None] * (residual - self._apply(frame.rows, off))
-        fitted = w * window_sums(self.layout, covariance, self.places, frame.rows)
-        free = evidence.seen & ~evidence.held
+    def misfit(self, frame: "Frame", fit: "Fit", evidence: Evidence) -> Misfit:
+        """What is left of the frame."""
+        w, free = frame.weight, evidence.seen & ~evidence.held
+        fitted = w * window_sums(self.layout, fit.covariance, self.places, frame.rows)
         root = jnp.linalg.cholesky(jnp.where(free[:, None, None], evidence.precision, jnp.eye(3)))
         root = jnp.where(free[:, None, None], jnp.swapaxes(root, 1, 2), 0.0)
-        itself = jnp.argmax(self.neighbours == jnp.arange(len(w))[:, None], axis=1)
-        itself = self.places[jnp.arange(len(w)), itself, itself]
-        seen = window_sums(self.layout, covariance, itself[:, None, None], root[:, None])
+        seen = window_sums(self.layout, fit.covariance, self.own_place, root[:, None])
         return Misfit(
-            force=force,
+            force=jnp.sqrt(w)[:, None] * fit.left,
             force_degrees=jnp.sum(jnp.where(w > 0, 3 - fitted, 0.0)),
-            position=jnp.einsum("nij,nj->ni", root, off),
+            position=jnp.einsum("nij,nj->ni", root, fit.off),
             position_degrees=jnp.sum(jnp.where(free, 3 - seen, 0.0)),
         )
 
-    def _calibrated(self, frame: "Frame") -> Float[Array, "n 3"]:
+    def _calibrated(self, frame: "Frame", fit: "Fit") -> Float[Array, "n 3"]:
         """D, shrunk towards 0 by the share of |D|^2 that its own error makes up.
 
         D is taken at an estimate of x, whose covariance is A^-1. Where nothing moves D is all error, and as a regressor
         would pull s wherever the error points; its expectation given what was estimated does not [regression
         calibration: Carroll et al. 2006, doi:10.1201/9781420010138].
         """
-        error = window_sums(self.layout, inverse_band(frame.factor), self.places, frame.turn)
+        error = window_sums(self.layout, fit.covariance, self.places, frame.turn)
         squared = jnp.sum(frame.slope**2, axis=1)
         return jnp.maximum(1 - error / jnp.maximum(squared, 1e-30), 0.0)[:, None] * frame.slope
 
@@ -265,6 +274,19 @@ class Frame(eqx.Module):
     """y - x, zero where nothing was seen [m]."""
     converged: Bool[Array, ""]
     """Whether the search for x, if there was one, came to an end."""
+
+
+class Fit(eqx.Module):
+    """The state that explains a frame best."""
+
+    residual: Float[Array, "n 3"]
+    """Unbalanced force where the particles were seen, e = r + H (y - x) [N]."""
+    left: Float[Array, "n 3"]
+    """Unbalanced force at the state [N]."""
+    off: Float[Array, "n 3"]
+    """Seen less fitted position [m]."""
+    covariance: BlockTridiagonal
+    """The blocks of A^-1 where A has blocks [m^2]."""
 
 
 class Information(eqx.Module):

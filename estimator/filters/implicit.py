@@ -82,11 +82,13 @@ class ImplicitFilter(Filter):
             belief = stated.belief
             assert isinstance(belief, AttachmentBelief)
             s = belief.bounded(stated.b)
-            stale = [grasp for grasp in self._grasps if grasp.noise != self._noise or grasp.distance(s) > far]
-            if not stale:
+            stale = [grasp.noise != self._noise or grasp.distance(s) > far for grasp in self._grasps]
+            if not any(stale):
                 break
-            for grasp in stale:
-                grasp.again(self._balance, s, self._noise)
+            self._grasps = [
+                grasp.again(self._balance, s, self._noise) if old else grasp
+                for grasp, old in zip(self._grasps, stale, strict=True)
+            ]
             total = sum(grasp.precision for grasp in self._grasps), sum(grasp.shift for grasp in self._grasps)
             stated = _refined(eqx.tree_at(lambda one: (one.precision, one.shift), belief, total))
         return stated
@@ -105,13 +107,13 @@ def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
 class _Grasp:
     """The frames between closing and opening the jaws, and what they say together."""
 
-    def __init__(self) -> None:
+    def __init__(self, noise: Noise | None = None) -> None:
+        """Of no frames yet; `noise` is None while frames come in, each linearised for the belief of its time."""
+        self.noise = noise
         self.precision: Float[Array, "n n"] | float = 0.0
         self.shift: Float[Array, " n"] | float = 0.0
         self.misfit: Misfit | None = None
-        """What they leave unexplained, once they were linearised again."""
-        self.noise: Noise | None = None
-        """That it was linearised again for."""
+        """What they leave unexplained, if they were linearised again."""
         self._frames: list[tuple[Evidence, Float[Array, "n 3"], Float[Array, " n"]]] = []
         """What was seen, the state, and the s of the linearisation."""
 
@@ -123,15 +125,14 @@ class _Grasp:
         """How far s is from where a frame was linearised."""
         return max(float(jnp.max(jnp.abs(s - at))) for _, _, at in self._frames)
 
-    def again(self, balance: ForceBalance, s: Float[Array, " n"], noise: Noise) -> None:
-        """Linearise all frames at s."""
-        frames, self._frames = self._frames, []
-        self.precision, self.shift, self.misfit, self.noise = 0.0, 0.0, None, noise
-        for evidence, x, _ in frames:
-            noisy = evidence.widened(noise.position)
-            x, found, misfit = _information(balance.widened(noise.force), x, s, noisy)
-            self.take(evidence, x, found)
-            self.misfit = misfit if self.misfit is None else self.misfit + misfit
+    def again(self, balance: ForceBalance, s: Float[Array, " n"], noise: Noise) -> "_Grasp":
+        """The same frames, linearised at s for a noise."""
+        grasp, balance = _Grasp(noise), balance.widened(noise.force)
+        for evidence, x, _ in self._frames:
+            x, found, misfit = _information(balance, x, s, evidence.widened(noise.position))
+            grasp.take(evidence, x, found)
+            grasp.misfit = misfit if grasp.misfit is None else grasp.misfit + misfit
+        return grasp
 
 
 @eqx.filter_jit
@@ -143,7 +144,7 @@ def _update(
     start: Float[Array, "n 3"],
 ) -> tuple[Update, Information]:
     frame = balance.approach(balance.settle(start, s, evidence), s, evidence)
-    found = balance.information(frame)
+    found = balance.information(frame, balance.fit(frame))
     belief = belief.add(found.precision, found.shift)
     gaussian = belief.gaussian()
     nis = _normalised_innovation(found, gaussian.factor, evidence)
@@ -158,7 +159,8 @@ def _information(
     balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
 ) -> tuple[Float[Array, "n 3"], Information, Misfit]:
     frame = balance.approach(x, s, evidence)
-    return frame.x, balance.information(frame), balance.misfit(frame, evidence)
+    fit = balance.fit(frame)
+    return frame.x, balance.information(frame, fit), balance.misfit(frame, fit, evidence)
 
 
 @eqx.filter_jit
