@@ -42,25 +42,32 @@ class Weight(Term):
 
 
 class Bed(Term):
-    """k/2 min(0, (x - x_rest) . up)^2: the bed is where the sheet lay at rest, and only pushes.
+    """k/2 min(0, x . up - height)^2: the bed only pushes, and carries the sheet where it lay at rest.
 
     Taking the bed's height from the sheet itself keeps errors of the camera's height out of the contact.
     """
 
     vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
     height: Float[Array, " n"]
-    """Height of the bed below each particle [m]."""
+    """Height at which each particle touches the bed [m]."""
     up: Float[Array, " 3"]
     """Unit vector against gravity."""
     stiffness: Float[Array, ""]
     """[N/m] per particle."""
 
     @classmethod
-    def build(cls, rest: Float[np.ndarray, "n 3"], *, up: Float[np.ndarray, " 3"], stiffness: float) -> "Bed":
-        """A bed that touches the sheet at rest everywhere."""
+    def build(
+        cls,
+        rest: Float[np.ndarray, "n 3"],
+        *,
+        load: Float[np.ndarray, " n"],
+        up: Float[np.ndarray, " 3"],
+        stiffness: float,
+    ) -> "Bed":
+        """A bed in which the sheet at rest lies so deep that it carries the load on each particle [N]."""
         return cls(
             vertices=np.arange(len(rest))[:, None],
-            height=jnp.asarray(rest @ up),
+            height=jnp.asarray(rest @ up + load / stiffness),
             up=jnp.asarray(up),
             stiffness=jnp.asarray(stiffness, dtype=float),
         )

@@ -11,9 +11,11 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import log_ndtr, logsumexp
 from jax.scipy.stats import norm
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 BISECTIONS = 50
+RARE = 1e-12
+"""Added to a drawn share, which may be too small for its logarithm."""
 LEARNED = 0.2
 """Part of each step that the shares take: with all of it, a particle about even tips them, and they tip it back."""
 
@@ -92,6 +94,11 @@ class SpikeAndSlab(eqx.Module):
         count = jnp.sum(jnp.where(counted, mixture.weight[1:], 0.0), axis=1)
         share = (self.even / len(count) + count) / (self.even + jnp.sum(count))
         return eqx.tree_at(lambda prior: prior.share, self, (1 - LEARNED) * self.share + LEARNED * share)
+
+    def drawn(self, state: Int[Array, " n"], key: PRNGKeyArray) -> Float[Array, " _rungs"]:
+        """Shares drawn from what is known of them given each particle's state: 0 is free, k on the k-th rung."""
+        count = jnp.zeros(len(self.mean)).at[state].add(1.0)[1:]
+        return jax.random.dirichlet(key, self.even / len(count) + count) + RARE
 
     def posterior(
         self, mean: Float[Array, " n"], variance: Float[Array, " n"], log_odds: Float[Array, " n"]

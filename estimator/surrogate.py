@@ -38,5 +38,7 @@ def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane =
             Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=declaration.gravity)
         )
         if declaration.bed:
-            terms.append(Bed.build(mesh.rest, up=-gravity / np.linalg.norm(gravity), stiffness=BED_STIFFNESS * k))
+            size = np.linalg.norm(gravity)
+            load = declaration.areal_density * size * mesh.particle_area
+            terms.append(Bed.build(mesh.rest, load=load, up=-gravity / size, stiffness=BED_STIFFNESS * k))
     return SheetEnergy.build(mesh.rest, tuple(terms), Layout.from_pattern(mesh.adjacency, mesh.rest))

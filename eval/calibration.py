@@ -29,20 +29,27 @@ class Calibration:
     """None where there is nothing to judge by."""
 
     nees_per_dof: float | None
+    nees_attached: float | None
+    """The same over the truly attached particles alone: a free one is exactly where a prior may have its peak."""
     coverage_90: float | None
     """Share of particles whose true stiffness lies in the central 90 % interval of its marginal."""
     ece: float | None
     """Expected calibration error of the probabilities of being attached."""
 
 
-def nees_per_dof(belief: Belief, stiffness: Float[np.ndarray, " n"]) -> float | None:
+def nees_per_dof(
+    belief: Belief, stiffness: Float[np.ndarray, " n"], *, among: Bool[np.ndarray, " n"] | None = None
+) -> float | None:
     """(b_hat - b*)^T Sigma^-1 (b_hat - b*) / n over the particles whose b* and variance are finite, in float64.
+
+    With `among` only over those, the others marginalised out.
 
     Raises:
         ValueError: the covariance is not positive definite.
     """
     truth = belief.coordinate(stiffness)
     known = np.isfinite(truth) & np.isfinite(np.diagonal(belief.covariance))
+    known = known if among is None else known & among
     if not known.any():
         return None
     error = belief.mean[known].astype(np.float64) - truth[known]
@@ -83,9 +90,10 @@ def calibration(
     *,
     probability: Float[np.ndarray, " n"] | None = None,
 ) -> Calibration:
-    """All three figures; `probability` is that of being attached, None for an estimator that states none."""
+    """All figures; `probability` is that of being attached, None for an estimator that states none."""
     return Calibration(
         nees_per_dof=nees_per_dof(belief, stiffness),
+        nees_attached=nees_per_dof(belief, stiffness, among=attached),
         coverage_90=coverage(belief, stiffness),
         ece=None if probability is None else expected_calibration_error(probability, attached),
     )

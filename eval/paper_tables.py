@@ -45,7 +45,7 @@ FIGURES = (
     ("PUG %", ("detection", "by_dilation", "0", "pug"), 100.0, 0),
     ("PCD % one ring", ("detection", "by_dilation", "1", "pcd"), 100.0, 0),
     ("PUG % one ring", ("detection", "by_dilation", "1", "pug"), 100.0, 0),
-    ("NEES/dof", ("calibration", "nees_per_dof"), 1.0, 2),
+    ("NEES/dof attached", ("calibration", "nees_attached"), 1.0, 2),
     ("update s", ("timing", "update_s", "median"), 1.0, 2),
 )
 

@@ -82,7 +82,7 @@ def result(
             "converged": detection.converged,
         },
         "noise": {"force_sd_ratio": detection.force_sd_ratio, "position_sd_ratio": detection.position_sd_ratio},
-        "calibration": {"nees_per_dof": None, "coverage_90": None, "ece": None},
+        "calibration": {"nees_per_dof": None, "nees_attached": None, "coverage_90": None, "ece": None},
         "tracking": {"rms_m": None},
         "safety": {"limit_j": None, "max_mean_boundary_energy_j": None, "violations": None},
         "entropy": {
@@ -133,7 +133,10 @@ def with_truth(
             observable={"by_dilation": _agreements(sheet, detection, carried, knowable=observable)},
         )
     _section(scored, "calibration").update(
-        nees_per_dof=judged.nees_per_dof, coverage_90=judged.coverage_90, ece=judged.ece
+        nees_per_dof=judged.nees_per_dof,
+        nees_attached=judged.nees_attached,
+        coverage_90=judged.coverage_90,
+        ece=judged.ece,
     )
     _section(scored, "tracking").update(rms_m=tracking(sheet, estimates, truth).rms)
     _section(scored, "safety").update(max_mean_boundary_energy_j=mean_boundary_energy(truth))

@@ -42,7 +42,7 @@ FIGURES = (
     ("PUG % exact", ("detection", "by_dilation", "0", "pug"), 100.0, 1),
     ("PCD % one ring", ("detection", "by_dilation", "1", "pcd"), 100.0, 1),
     ("PUG % one ring", ("detection", "by_dilation", "1", "pug"), 100.0, 1),
-    ("NEES/dof", ("calibration", "nees_per_dof"), 1.0, 2),
+    ("NEES/dof attached", ("calibration", "nees_attached"), 1.0, 2),
     ("coverage of 90 %", ("calibration", "coverage_90"), 1.0, 2),
     ("ECE", ("calibration", "ece"), 1.0, 3),
     ("tracking mm", ("tracking", "rms_m"), 1e3, 2),

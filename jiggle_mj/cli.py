@@ -322,8 +322,8 @@ def _show(figures: dict, out: Path, as_json: bool) -> None:
             )
         console.print(table)
         parts = [f"{detection['n_attached']} truly attached"]
-        if calibration["nees_per_dof"] is not None:
-            parts.append(f"NEES per dof {calibration['nees_per_dof']:.2f}")
+        if calibration["nees_attached"] is not None:
+            parts.append(f"NEES per dof of the attached {calibration['nees_attached']:.2f}")
         if figures["tracking"]["rms_m"] is not None:
             parts.append(f"tracking RMS {1e3 * figures['tracking']['rms_m']:.2f} mm")
         console.print(", ".join(parts))

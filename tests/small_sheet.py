@@ -151,10 +151,12 @@ def follow(filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence
 
 
 def nees(belief: AttachmentBelief) -> float:
-    """Squared error of s in units of the stated covariance, per degree of freedom, where attached means `STIFFNESS`."""
+    """Squared error of the attached particles' s in units of their stated covariance, per degree of freedom, where
+    attached means `STIFFNESS`; free ones are exactly where the prior has its peak, and would be none."""
+    where = np.ix_(attached(), attached())
     mean, covariance = (np.asarray(part) for part in belief.moments())
-    error = mean - np.asarray(belief.bounded(jnp.asarray(STIFFNESS * attached())))
-    return float(error @ np.linalg.solve(covariance, error) / len(error))
+    error = (mean - np.asarray(belief.bounded(jnp.asarray(STIFFNESS * attached()))))[attached()]
+    return float(error @ np.linalg.solve(covariance[where], error) / len(error))
 
 
 def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:

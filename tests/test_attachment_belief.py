@@ -90,18 +90,6 @@ def test_an_attached_neighbour_raises_the_odds():
     assert float(belief.posterior().attached[1]) == pytest.approx(expit(logit(PROBABILITY) + coupling), rel=1e-6)
 
 
-def test_sweeps_end_at_rest_or_say_that_they_did_not():
-    """Two whose sum is that of one softly attached take turns in being it: propagation finds no rest there."""
-    mean, sd = np.array([0.002, 0.1, 0.99]), np.array([1e-3, 5e-3, 5e-2])
-    apart = chain(3, coupling=1.2).add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2))
-    rested, converged = apart.converge(60)
-    assert converged
-    np.testing.assert_allclose(rested.posterior().attached, apart.refine(200).posterior().attached, atol=5e-3)
-    precision = np.ones((2, 2)) / 0.01**2
-    shared = chain(2, coupling=1.2).add(jnp.asarray(precision), jnp.asarray(precision @ [0.05, 0.05]))
-    assert not shared.converge(60)[1]
-
-
 def test_intervals_open_upwards_where_only_a_lower_end_is_known():
     mean, sd = np.array([0.0, 0.1, 0.99]), np.array([1e-3, 5e-3, 5e-2])
     belief = chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2)).refine(30)

@@ -32,11 +32,12 @@ def runs():
 def test_the_attached_particles_are_found_and_no_others(runs, stiffness):
     """Four corner lifts with 0.1 mm of noise. Particles inside a stiff patch bear no load: nothing can show them.
 
-    Beside a weld hardly anything moves, so that single neighbours may pass for held; none further off.
+    Beside a weld hardly anything moves, so that single neighbours may pass for held, and some of its rim may not.
     """
     _, said = runs[stiffness]
     found, around = np.asarray(said.probability) > 0.5, rim()
-    assert (found & around).sum() >= 0.9 * around.sum()
+    assert (found & around).sum() >= (0.9 if stiffness <= STIFFNESS else 0.6) * around.sum()
+    assert np.asarray(said.probability)[around].mean() > 0.6
     assert not (found & ~dilate(attached(), sheet().faces, 1)).any()
     if stiffness <= STIFFNESS:
         assert (found != attached()).sum() <= 1
@@ -67,7 +68,7 @@ def test_a_free_sheet_has_no_attachment():
 
 
 def test_errors_are_as_large_as_stated(runs):
-    """NEES per degree of freedom of s where the truth is no bound of it; a draw from the prior would give 1."""
+    """NEES per degree of freedom of s where the truth is no bound of it."""
     assert 0.3 < nees(runs[STIFFNESS][1].belief) < 2
 
 

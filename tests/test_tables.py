@@ -60,12 +60,12 @@ def test_means_and_ranges_by_hand():
     one, two = scored(), scored()
     two["detection"]["by_dilation"]["0"]["pcd"] = 1.0
     for figures in (one, two):
-        figures["calibration"]["nees_per_dof"] = None
+        figures["calibration"]["nees_attached"] = None
     cells = [cell.strip() for cell in markdown({ROW: [one, two]}).splitlines()[2].split("|")[1:-1]]
     headings = [cell.strip() for cell in markdown({}).splitlines()[0].split("|")[1:-1]]
     found = dict(zip(headings, cells, strict=True))
     assert (found["scene"], found["attached"], found["PCD % exact"]) == ("arc", "2", "75.0 (50.0…100.0)")
-    assert (found["NEES/dof"], found["update s"]) == ("\N{EN DASH}", f"{np.mean([0.2, 0.2]):.2f}")
+    assert (found["NEES/dof attached"], found["update s"]) == ("\N{EN DASH}", f"{np.mean([0.2, 0.2]):.2f}")
 
 
 def test_the_readmes_table_has_the_rows_that_are_asked_for():

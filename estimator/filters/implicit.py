@@ -5,11 +5,14 @@ attachment shows only once its surroundings are believed stiff: when the jaws op
 what is believed now are linearised again, and replace what they said before. Nothing is counted twice.
 """
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Stated, Update
 from jiggle_mj.estimator.filters.force_balance import ForceBalance, Information
@@ -19,18 +22,20 @@ from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 
 SPIKE = 3e-4
 """Width of s where free."""
-RUNGS, SPREAD, EVEN = tuple(0.003 * 10 ** (i / 4) for i in range(11)), 0.5, 3.0
+RUNGS, SPREAD, EVEN = tuple(0.003 * 10 ** (i / 4) for i in range(11)), 0.3, 3.0
 """Of s where attached, from hardly felt to rigid; their relative widths; see `SpikeAndSlab.even`."""
-PROBABILITY, COUPLING = 0.04, 1.2
+PROBABILITY, COUPLING = 0.047, 1.0
 """Of being attached without attached neighbours, and what each adds to the log odds: 2.7 of them make it even."""
-SWEEPS, LAST_SWEEPS = 2, 60
-"""Of the belief after a frame, and at most when the jaws open."""
+SWEEPS = 2
+"""Of expectation propagation after a frame."""
+BURN_IN, PASSING, SAMPLES = 1, 2, 8
+"""Rounds of samples when the jaws open: left out, kept while grasps are linearised again, and kept at the end."""
 STALE = 0.1
 """A grasp is linearised again when some s has moved further than this from where it was."""
 FELT = 3e-3
 """The same, before the noise is judged by what a grasp leaves unexplained: the softest attachment's s."""
 PASSES = 3
-"""Over stale grasps, and over noises, at most, each time that the jaws open."""
+"""Over stale grasps, and over noises, at most, when the jaws open."""
 
 
 class ImplicitFilter(Filter):
@@ -67,18 +72,18 @@ class ImplicitFilter(Filter):
         if self._between:
             return None
         self._between = True
-        stated = self._settled(_refined(belief), STALE)
+        stated = self._settled(_sampled(belief, PASSING), STALE, PASSES)
         for _ in range(PASSES):
             if self._learned() == self._noise:
                 break
-            stated = self._settled(stated, FELT)
+            stated = self._settled(stated, FELT, 1)
             self._noise = self._learned()
-            stated = self._settled(stated, STALE)
-        return stated
+            stated = self._settled(stated, STALE, PASSES)
+        return _sampled(stated.belief, SAMPLES)
 
-    def _settled(self, stated: Stated, far: float) -> Stated:
+    def _settled(self, stated: Stated, far: float, passes: int) -> Stated:
         """After grasps that were linearised further than `far` from what is believed were linearised again."""
-        for _ in range(PASSES):
+        for _ in range(passes):
             belief = stated.belief
             assert isinstance(belief, AttachmentBelief)
             s = belief.bounded(stated.b)
@@ -90,7 +95,7 @@ class ImplicitFilter(Filter):
                 for grasp, old in zip(self._grasps, stale, strict=True)
             ]
             total = sum(grasp.precision for grasp in self._grasps), sum(grasp.shift for grasp in self._grasps)
-            stated = _refined(eqx.tree_at(lambda one: (one.precision, one.shift), belief, total))
+            stated = _sampled(eqx.tree_at(lambda one: (one.precision, one.shift), belief, total), PASSING)
         return stated
 
     def _learned(self) -> Noise:
@@ -163,9 +168,13 @@ def _information(
     return frame.x, balance.information(frame, fit), balance.misfit(frame, fit, evidence)
 
 
+def _sampled(belief: Any, rounds: int) -> Stated:
+    return _state_sampled(belief, jnp.asarray(rounds))
+
+
 @eqx.filter_jit
-def _refined(belief: AttachmentBelief) -> Stated:
-    return _stated(*belief.converge(LAST_SWEEPS))
+def _state_sampled(belief: AttachmentBelief, rounds: Int[Array, ""]) -> Stated:
+    return _stated(*belief.sampled(jax.random.key(0), burn_in=BURN_IN, rounds=rounds))
 
 
 def _stated(belief: AttachmentBelief, converged: Bool[Array, ""]) -> Stated:

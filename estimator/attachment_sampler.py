@@ -1,0 +1,144 @@
+"""Which particles are attached: samples of the states with all stiffnesses integrated out.
+
+Given the state of every particle (free, or on which rung of the ladder), the bounded stiffnesses s are Gaussian, and
+the probability of a state is a closed form. A sweep draws the state of each particle in turn, given those of all
+others, and then the shares of the rungs [collapsed Gibbs sampling for a spike and a slab: George & McCulloch 1997,
+Statistica Sinica 7:339]. Unlike expectation propagation it finds its way where several particles may carry one load,
+and has no fixed point to miss. To keep the form closed, the prior's normals are not cut off to [0, 1].
+
+Between two particles that change their state nothing that the others depend on changes, so all are looked at together,
+and a sweep costs a rank-one update for each change.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jiggle_mj.estimator.block_tridiagonal import lower_inverse
+from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
+
+
+class Sampled(eqx.Module):
+    """Averages over the sweeps."""
+
+    weight: Float[Array, "c n"]
+    """Probability of each state of each particle: free first, then the rungs."""
+    mean: Float[Array, " n"]
+    """Of s."""
+    variance: Float[Array, " n"]
+    share: Float[Array, " _rungs"]
+    """Of each rung among attached particles."""
+    agree: Bool[Array, ""]
+    """Whether the first half of the sweeps says the same as the second."""
+
+
+class Sampler(eqx.Module):
+    """The posterior to draw from."""
+
+    stiffness: SpikeAndSlab
+    log_odds: Float[Array, ""]
+    coupling: Float[Array, ""]
+    neighbours: Int[Array, "n d"]
+    """Padded with n."""
+    precision: Float[Array, "n n"]
+    """Of the evidence about s."""
+    shift: Float[Array, " n"]
+
+    def run(self, state: Int[Array, " n"], key: PRNGKeyArray, *, burn_in: int, rounds: int | Int[Array, ""]) -> Sampled:
+        """Average `rounds` rounds of `ROUND` sweeps after leaving out the first `burn_in` from a state."""
+        skipped, total = burn_in * ROUND, rounds * ROUND
+
+        def sweep(k, carried):
+            state, moments, share, weights, sums = carried
+            one, other = jax.random.split(jax.random.fold_in(key, k))
+            state, moments, weight = self._sweep(state, moments, share, one)
+            share, mean = self.stiffness.drawn(state, other), moments.mean
+            half = jnp.where(k < skipped + total // 2, 0, 1)
+            kept = jnp.where(k < skipped, 0.0, 1.0)
+            added = mean, jnp.diagonal(moments.covariance) + mean**2, share
+            sums = jax.tree.map(lambda sum, one: sum + kept * one, sums, added)
+            return state, moments, share, weights.at[half].add(kept * weight), sums
+
+        def round(k, carried):
+            state, *others = carried
+            first = state, self._moments(state), *others
+            state, _, *others = jax.lax.fori_loop(k * ROUND, (k + 1) * ROUND, sweep, first)
+            return state, *others
+
+        share, nothing = self.stiffness.share, jnp.zeros_like(self.shift)
+        halves = jnp.zeros((2, len(self.stiffness.mean), len(state)))
+        first = state, share, halves, (nothing, nothing, jnp.zeros_like(share))
+        _, _, halves, sums = jax.lax.fori_loop(0, burn_in + rounds, round, first)
+        mean, squared, share = jax.tree.map(lambda sum: sum / jnp.asarray(total, sum.dtype), sums)
+        attached = 1 - halves[:, 0] / jnp.sum(halves, axis=1)
+        return Sampled(
+            weight=jnp.sum(halves, axis=0) / jnp.sum(halves, axis=(0, 1))[None],
+            mean=mean,
+            variance=squared - mean**2,
+            share=share,
+            agree=jnp.mean(jnp.abs(attached[0] - attached[1])) < AGREE,
+        )
+
+    def _moments(self, state: Int[Array, " n"]) -> "Moments":
+        precision, shift = self._normals
+        inverse = lower_inverse(jnp.linalg.cholesky(self.precision + jnp.diag(precision[state])))
+        covariance = inverse.T @ inverse
+        return Moments(mean=covariance @ (self.shift + shift[state]), covariance=covariance)
+
+    @property
+    def _normals(self) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+        """The prior's normals in information form."""
+        return self.stiffness.sd**-2, self.stiffness.mean * self.stiffness.sd**-2
+
+    def _sweep(
+        self, state: Int[Array, " n"], moments: "Moments", share: Float[Array, " _rungs"], key: PRNGKeyArray
+    ) -> tuple[Int[Array, " n"], "Moments", Float[Array, "c n"]]:
+        """Every particle once, in a random order; with the probabilities that the states were drawn from."""
+        n, centre, width = len(state), self.stiffness.mean[:, None], self.stiffness.sd[:, None] ** 2
+        precision, shift = self._normals
+        by_order, by_noise = jax.random.split(key)
+        turn, noise = jax.random.permutation(by_order, n), jax.random.gumbel(by_noise, (len(width), n))
+
+        def change(carried):
+            state, moments, weight, at = carried
+            mean, covariance = moments.mean, moments.covariance
+            own = jnp.diagonal(covariance)
+            apart = 1 / jnp.maximum(1 / own - precision[state], FAINT)
+            told = (apart * (mean / own - shift[state]))[None]
+            spread = apart[None] + width
+            attached = jnp.append(jnp.where(state > 0, 1.0, 0.0), 0.0)
+            odds = self.log_odds + self.coupling * jnp.sum(attached[self.neighbours], axis=1)
+            seen = -0.5 * (told - centre) ** 2 / spread - 0.5 * jnp.log(spread)
+            log_weight = seen.at[1:].add(jnp.log(share)[:, None] + odds[None])
+            drawn = jnp.argmax(log_weight + noise, axis=0)
+            waiting = jnp.where((drawn != state) & (turn >= at), turn, n)
+            i = jnp.argmin(waiting)
+            until = waiting[i]
+            new = jnp.where(until < n, drawn[i], state[i])
+            weight = jnp.where(((turn >= at) & (turn <= until))[None], jax.nn.softmax(log_weight, axis=0), weight)
+            stiffer, further = precision[new] - precision[state[i]], shift[new] - shift[state[i]]
+            column = covariance[:, i]
+            gain = column / (1 + stiffer * column[i])
+            moments = Moments(
+                mean=mean + gain * (further - stiffer * mean[i]),
+                covariance=covariance - jnp.outer(stiffer * gain, column),
+            )
+            return state.at[i].set(new), moments, weight, until + 1
+
+        first = state, moments, jnp.zeros((len(width), n)), jnp.asarray(0)
+        return jax.lax.while_loop(lambda carried: carried[-1] < n, change, first)[:3]
+
+
+class Moments(eqx.Module):
+    """Of s, given the states."""
+
+    mean: Float[Array, " n"]
+    covariance: Float[Array, "n n"]
+
+
+ROUND = 10
+"""Sweeps after which the covariance is computed anew, free of what its updates were rounded by."""
+FAINT = 1e-8
+"""Least precision of what the evidence says of a particle."""
+AGREE = 0.02
+"""Mean difference of P(attached) between the two halves that counts as none."""

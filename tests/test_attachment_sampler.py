@@ -1,0 +1,110 @@
+"""Samples of who is attached against the sum over all states."""
+
+from itertools import product
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior
+from jiggle_mj.estimator.attachment_sampler import Sampled, Sampler
+from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
+from scipy.special import logit
+
+N, PROBABILITY, COUPLING = 5, 0.1, 1.0
+EDGES = np.column_stack([np.arange(N - 1), np.arange(1, N)])
+ROUNDS = 3000
+
+
+def prior(even: float = 1e12) -> AttachmentPrior:
+    """A row of particles; by default so sure of its shares that nothing is learned."""
+    stiffness = SpikeAndSlab.build(spike=3e-3, rungs=(0.03, 0.3), spread=0.3, even=even)
+    return AttachmentPrior.build(N, EDGES, stiffness=stiffness, probability=PROBABILITY, coupling=COUPLING)
+
+
+def seen(load: float) -> tuple[np.ndarray, np.ndarray]:
+    """Precision and shift: the first two carry a load together, the last is free, of the third nothing is known."""
+    precision = np.diag([1.0, 1.0, 0.0, 1e3, 1e5])
+    precision[:2, :2] += 1e4
+    return precision, np.array([1e4 * load, 1e4 * load, 0.0, 30.0, 0.0])
+
+
+def sampler(load: float, even: float = 1e12) -> Sampler:
+    ising, (precision, shift) = prior(even), seen(load)
+    return Sampler(
+        stiffness=ising.stiffness,
+        log_odds=ising.log_odds,
+        coupling=ising.coupling,
+        neighbours=ising.neighbours,
+        precision=jnp.asarray(precision),
+        shift=jnp.asarray(shift),
+    )
+
+
+def sampled(load: float, rounds: int = ROUNDS, even: float = 1e12) -> Sampled:
+    return eqx.filter_jit(sampler(load, even).run)(
+        jnp.zeros(N, int), jax.random.key(1), burn_in=2, rounds=jnp.asarray(rounds)
+    )
+
+
+def summed(load: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Probabilities of all states of each particle, mean and variance of s."""
+    stiffness, (precision, shift) = prior().stiffness, seen(load)
+    centre, narrow = np.asarray(stiffness.mean), np.asarray(stiffness.sd) ** -2.0
+    total, weight, mean, squared = 0.0, np.zeros((3, N)), np.zeros(N), np.zeros(N)
+    for each in product(range(3), repeat=N):
+        state = np.array(each)
+        T, attached = np.diag(narrow[state]), np.minimum(state, 1)
+        covariance = np.linalg.inv(precision + T)
+        at = covariance @ (shift + T @ centre[state])
+        log = attached @ np.full(N, logit(PROBABILITY) + np.log(0.5)) + COUPLING * (attached[1:] @ attached[:-1])
+        log += 0.5 * (np.linalg.slogdet(T)[1] + np.linalg.slogdet(covariance)[1])
+        log += 0.5 * (at @ np.linalg.solve(covariance, at) - centre[state] @ T @ centre[state])
+        total += (p := np.exp(log))
+        weight += p * (state == np.arange(3)[:, None])
+        mean, squared = mean + p * at, squared + p * (at**2 + np.diag(covariance))
+    return weight / total, mean / total, squared / total - (mean / total) ** 2
+
+
+@pytest.mark.parametrize(("load", "tolerance"), [(0.0, 0.02), (0.03, 0.02), (0.06, 0.02), (0.3, 0.05)])
+def test_samples_are_those_of_the_posterior(load, tolerance):
+    """Also where the load of two may be that of one, so that each of them takes turns; rarely, where it is large."""
+    found, (weight, mean, variance) = sampled(load), summed(load)
+    np.testing.assert_allclose(found.weight, weight, atol=tolerance)
+    np.testing.assert_allclose(found.mean, mean, atol=0.05 * np.sqrt(variance).max())
+    np.testing.assert_allclose(found.variance, variance, rtol=0.15)
+    assert found.agree
+
+
+def test_a_chain_that_has_not_seen_enough_says_so():
+    assert not sampled(0.03, rounds=1).agree
+
+
+def test_a_sweep_keeps_the_moments_up_to_date():
+    one = sampler(0.06)
+    state = jnp.array([1, 2, 0, 0, 2])
+    after, moments, _ = eqx.filter_jit(one._sweep)(state, one._moments(state), one.stiffness.share, jax.random.key(3))
+    assert (after != state).any()
+    anew = one._moments(after)
+    np.testing.assert_allclose(moments.mean, anew.mean, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(moments.covariance, anew.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_shares_are_learned_from_those_that_are_attached():
+    """Two stiff ones; with few expected beforehand the stiff rung is the commoner."""
+    found = sampled(0.6, even=1.0)
+    assert float(found.share[1]) > 0.7
+    assert float(jnp.sum(found.share)) == pytest.approx(1)
+
+
+def test_a_belief_takes_over_what_the_samples_say():
+    precision, shift = seen(0.06)
+    belief = AttachmentBelief.before(prior(), reference=30.0).add(jnp.asarray(precision), jnp.asarray(shift))
+    belief, agree = eqx.filter_jit(belief.sampled)(jax.random.key(1), burn_in=2, rounds=jnp.asarray(ROUNDS))
+    weight, mean, variance = summed(0.06)
+    posterior = belief.posterior()
+    assert agree
+    np.testing.assert_allclose(posterior.attached, 1 - weight[0], atol=0.02)
+    np.testing.assert_allclose(posterior.mean, np.clip(mean, 0, 1), atol=0.05 * np.sqrt(variance).max())
+    np.testing.assert_allclose(posterior.sd**2, variance, rtol=0.2)
