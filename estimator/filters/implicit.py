@@ -25,7 +25,9 @@ SPIKE = 3e-4
 RUNGS, SPREAD, EVEN = tuple(0.003 * 10 ** (i / 4) for i in range(11)), 0.3, 3.0
 """Of s where attached, from hardly felt to rigid; their relative widths; see `SpikeAndSlab.even`."""
 PROBABILITY, COUPLING = 0.047, 1.0
-"""Of being attached without attached neighbours, and what each adds to the log odds: 2.7 of them make it even."""
+"""Of being attached without attached neighbours, and what each adds to the log odds: three of an inner particle's six
+make it even, so that a free and an attached stretch are equally likely beforehand. A little more of either, and samples
+find everything attached where little is known, or nothing."""
 SWEEPS = 2
 """Of expectation propagation after a frame."""
 BURN_IN, PASSING, SAMPLES = 1, 2, 8
