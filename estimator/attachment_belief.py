@@ -1,64 +1,24 @@
 """Belief over where the sheet is attached and how stiffly, from soft to rigid.
 
 Each particle has a bounded stiffness s = b / (b + b_ref) in [0, 1]: 0 is free, 1 is a weld. What frames say of s adds
-up in information form. A priori a particle is free or attached (`spike_and_slab`), the likelier attached the more of
-its neighbours are: an Ising prior over the mesh [Besag 1986, doi:10.1111/j.2517-6161.1986.tb01412.x],
-
-    p(attached) ~ exp(h sum_i a_i + J sum_ij a_i a_j)    a_i in {0, 1}, ij the mesh's edges.
-
-Expectation propagation [Minka 2001, arXiv:1301.2294] replaces each particle's prior by a Gaussian, its site, and belief
-propagation passes the odds between neighbours. How stiff attachments of this tissue are is learned on the way
-(`SpikeAndSlab.learned`). All of it is kept from frame to frame, so that a few sweeps a frame are enough. Where several
-particles may carry one load propagation loses its way; `sampled` finds it, in seconds instead of milliseconds. float64
-throughout: a float32 covariance of 600 stiffnesses loses definiteness.
+up in information form. Expectation propagation [Minka 2001, arXiv:1301.2294] replaces each particle's prior
+(`attachment_prior`) by a Gaussian, its site, and belief propagation passes the odds between neighbours. How stiff
+attachments of this tissue are is learned on the way (`SpikeAndSlab.learned`). All of it is kept from frame to frame, so
+that a few sweeps a frame are enough. Where several particles may carry one load propagation loses its way; `sampled`
+finds it, in seconds instead of milliseconds. float64 throughout: a float32 covariance of 600 stiffnesses loses
+definiteness.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from jiggle_mj.estimator.attachment_sampler import Sampler
+from jiggle_mj.estimator.attachment_prior import AttachmentPrior
+from jiggle_mj.estimator.attachment_sampler import Sampled, Sampler
 from jiggle_mj.estimator.belief import entropy
 from jiggle_mj.estimator.block_tridiagonal import lower_inverse
-from jiggle_mj.estimator.mesh import neighbour_table, symmetric
-from jiggle_mj.estimator.spike_and_slab import Mixture, SpikeAndSlab
-
-
-class AttachmentPrior(eqx.Module):
-    """What is believed before anything is seen."""
-
-    stiffness: SpikeAndSlab
-    log_odds: Float[Array, ""]
-    """h: of a particle without attached neighbours."""
-    coupling: Float[Array, ""]
-    """J: what each attached neighbour adds to the log odds."""
-    neighbours: Int[Array, "n d"]
-    """Of each particle along the mesh's edges, padded with n."""
-    back: Int[Array, "n d"]
-    """Which place the particle has among the neighbours of each of its neighbours."""
-
-    @classmethod
-    def build(
-        cls,
-        n: int,
-        edges: Int[np.ndarray, "e 2"],
-        *,
-        stiffness: SpikeAndSlab,
-        probability: float,
-        coupling: float,
-    ) -> "AttachmentPrior":
-        """For n particles; `probability` is that of one none of whose neighbours is attached."""
-        table = neighbour_table(symmetric(n, edges))
-        back = np.argmax(table[table] == np.arange(n)[:, None, None], axis=2)
-        return cls(
-            stiffness=stiffness,
-            log_odds=jnp.asarray(np.log(probability) - np.log1p(-probability)),
-            coupling=jnp.asarray(coupling, dtype=float),
-            neighbours=jnp.asarray(np.where(table < 0, n, table)),
-            back=jnp.asarray(back),
-        )
+from jiggle_mj.estimator.spike_and_slab import Mixture
 
 
 class AttachmentBelief(eqx.Module):
@@ -118,18 +78,14 @@ class AttachmentBelief(eqx.Module):
         The chain begins at what is believed. The sites are those that give s the samples' mean and, as nearly as sites
         can, variance; the messages those that give the samples' P(attached).
         """
-        prior = self.prior.stiffness
         mixture, _ = self._mixture(*self._cavity(self.gaussian()))
-        sampler = Sampler(
-            stiffness=prior,
-            log_odds=self.prior.log_odds,
-            coupling=self.prior.coupling,
-            neighbours=self.prior.neighbours,
-            precision=self.precision,
-            shift=self.shift,
-        )
         state = jnp.where(mixture.attached > 0.5, 1 + jnp.argmax(mixture.weight[1:], axis=0), 0)
+        sampler = Sampler(prior=self.prior, precision=self.precision, shift=self.shift)
         found = sampler.run(state, key, burn_in=burn_in, rounds=rounds)
+        return self._saying(found), found.agree
+
+    def _saying(self, found: Sampled) -> "AttachmentBelief":
+        """Sites and messages that give what was sampled."""
 
         def narrower(_, sites):
             gaussian = eqx.tree_at(lambda belief: belief.site_precision, self, sites).gaussian()
@@ -147,7 +103,7 @@ class AttachmentBelief(eqx.Module):
         free = jnp.clip(found.weight[0], SURE, 1 - SURE)
         odds = jnp.log1p(-free) - jnp.log(free)
         each = (odds - factor - self.prior.log_odds) / jnp.maximum(jnp.sum(beside, axis=1), 1).astype(odds.dtype)
-        return eqx.tree_at(lambda belief: belief.message, belief, jnp.where(beside, each[:, None], 0.0)), found.agree
+        return eqx.tree_at(lambda belief: belief.message, belief, jnp.where(beside, each[:, None], 0.0))
 
     def sweep(self, gaussian: "Gaussian") -> "AttachmentBelief":
         """One of them, given what `gaussian` returned."""

@@ -14,8 +14,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jiggle_mj.estimator.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.block_tridiagonal import lower_inverse
-from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 
 
 class Sampled(eqx.Module):
@@ -35,11 +35,7 @@ class Sampled(eqx.Module):
 class Sampler(eqx.Module):
     """The posterior to draw from."""
 
-    stiffness: SpikeAndSlab
-    log_odds: Float[Array, ""]
-    coupling: Float[Array, ""]
-    neighbours: Int[Array, "n d"]
-    """Padded with n."""
+    prior: AttachmentPrior
     precision: Float[Array, "n n"]
     """Of the evidence about s."""
     shift: Float[Array, " n"]
@@ -52,7 +48,7 @@ class Sampler(eqx.Module):
             state, moments, share, weights, sums = carried
             one, other = jax.random.split(jax.random.fold_in(key, k))
             state, moments, weight = self._sweep(state, moments, share, one)
-            share, mean = self.stiffness.drawn(state, other), moments.mean
+            share, mean = self.prior.stiffness.drawn(state, other), moments.mean
             half = jnp.where(k < skipped + total // 2, 0, 1)
             kept = jnp.where(k < skipped, 0.0, 1.0)
             added = mean, jnp.diagonal(moments.covariance) + mean**2, share
@@ -65,8 +61,8 @@ class Sampler(eqx.Module):
             state, _, *others = jax.lax.fori_loop(k * ROUND, (k + 1) * ROUND, sweep, first)
             return state, *others
 
-        share, nothing = self.stiffness.share, jnp.zeros_like(self.shift)
-        halves = jnp.zeros((2, len(self.stiffness.mean), len(state)))
+        share, nothing = self.prior.stiffness.share, jnp.zeros_like(self.shift)
+        halves = jnp.zeros((2, len(self.prior.stiffness.mean), len(state)))
         first = state, share, halves, (nothing, nothing, jnp.zeros_like(share))
         _, _, halves, sums = jax.lax.fori_loop(0, burn_in + rounds, round, first)
         mean, squared, share = jax.tree.map(lambda sum: sum / jnp.asarray(total, sum.dtype), sums)
@@ -88,13 +84,13 @@ class Sampler(eqx.Module):
     @property
     def _normals(self) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
         """The prior's normals in information form."""
-        return self.stiffness.sd**-2, self.stiffness.mean * self.stiffness.sd**-2
+        return self.prior.stiffness.sd**-2, self.prior.stiffness.mean * self.prior.stiffness.sd**-2
 
     def _sweep(
         self, state: Int[Array, " n"], moments: "Moments", share: Float[Array, " _rungs"], key: PRNGKeyArray
     ) -> tuple[Int[Array, " n"], "Moments", Float[Array, "c n"]]:
         """Every particle once, in a random order; with the probabilities that the states were drawn from."""
-        n, centre, width = len(state), self.stiffness.mean[:, None], self.stiffness.sd[:, None] ** 2
+        n, centre, width = len(state), self.prior.stiffness.mean[:, None], self.prior.stiffness.sd[:, None] ** 2
         precision, shift = self._normals
         by_order, by_noise = jax.random.split(key)
         turn, noise = jax.random.permutation(by_order, n), jax.random.gumbel(by_noise, (len(width), n))
@@ -107,7 +103,7 @@ class Sampler(eqx.Module):
             told = (apart * (mean / own - shift[state]))[None]
             spread = apart[None] + width
             attached = jnp.append(jnp.where(state > 0, 1.0, 0.0), 0.0)
-            odds = self.log_odds + self.coupling * jnp.sum(attached[self.neighbours], axis=1)
+            odds = self.prior.log_odds + self.prior.coupling * jnp.sum(attached[self.prior.neighbours], axis=1)
             seen = -0.5 * (told - centre) ** 2 / spread - 0.5 * jnp.log(spread)
             log_weight = seen.at[1:].add(jnp.log(share)[:, None] + odds[None])
             drawn = jnp.argmax(log_weight + noise, axis=0)

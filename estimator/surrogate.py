@@ -34,11 +34,10 @@ def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane =
     terms: list[Term] = [elastic, IsometricBending.build(mesh, stiffness=plate)]
     gravity = np.asarray(declaration.gravity, dtype=float)
     if gravity.any():
-        terms.append(
-            Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=declaration.gravity)
-        )
+        weight = Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=declaration.gravity)
+        terms.append(weight)
         if declaration.bed:
-            size = np.linalg.norm(gravity)
-            load = declaration.areal_density * size * mesh.particle_area
-            terms.append(Bed.build(mesh.rest, load=load, up=-gravity / size, stiffness=BED_STIFFNESS * k))
+            up = -gravity / np.linalg.norm(gravity)
+            load = -np.asarray(weight.force) @ up
+            terms.append(Bed.build(mesh.rest, load=load, up=up, stiffness=BED_STIFFNESS * k))
     return SheetEnergy.build(mesh.rest, tuple(terms), Layout.from_pattern(mesh.adjacency, mesh.rest))

@@ -67,7 +67,7 @@ def doubts(figures: Mapping[str, Any]) -> list[str]:
     """Why to trust what was found less, from `result.json`; of a version that did not say, nothing."""
     said = []
     if not figures["detection"].get("converged", True):
-        said.append("The belief did not come to rest: its probabilities depend on when it was cut off.")
+        said.append("Two halves of the samples disagree: more of them would give other probabilities.")
     noise = figures.get("noise", {})
     for name, what in (("force_sd_ratio", "The model's forces"), ("position_sd_ratio", "The positions")):
         if (ratio := noise.get(name)) is not None and ratio > POOR_FIT:

@@ -91,7 +91,8 @@ class Detection:
     rule: str
     """In words, with its numbers; never depends on the scene's true stiffness."""
     converged: bool = True
-    """Whether the belief came to rest; where it did not, the figures are those of the moment that it was cut off."""
+    """Whether both halves of the samples that the belief was judged by agree; where they do not, more of them would say
+    something else. True where nothing was sampled."""
     force_sd_ratio: float | None = None
     """How many times the typed standard deviation of the model's force error the observations ask for, from 1 on; None
     where it is not learned."""

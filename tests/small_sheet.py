@@ -17,7 +17,9 @@ from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.surrogate import surrogate
 from jiggle_mj.eval import benchmark
+from jiggle_mj.eval.calibration import nees_per_dof
 
+from jiggle_mj.estimate import Belief
 from jiggle_mj.observation import Declaration
 
 SPACING = 7e-3
@@ -153,10 +155,11 @@ def follow(filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence
 def nees(belief: AttachmentBelief) -> float:
     """Squared error of the attached particles' s in units of their stated covariance, per degree of freedom, where
     attached means `STIFFNESS`; free ones are exactly where the prior has its peak, and would be none."""
-    where = np.ix_(attached(), attached())
     mean, covariance = (np.asarray(part) for part in belief.moments())
-    error = (mean - np.asarray(belief.bounded(jnp.asarray(STIFFNESS * attached()))))[attached()]
-    return float(error @ np.linalg.solve(covariance[where], error) / len(error))
+    stated = Belief(mean=mean, covariance=covariance, reference=float(belief.reference))
+    found = nees_per_dof(stated, STIFFNESS * attached(), among=attached())
+    assert found is not None
+    return found
 
 
 def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:

@@ -5,7 +5,8 @@ from itertools import product
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 from scipy.special import expit, logit
 

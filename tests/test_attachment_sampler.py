@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.attachment_sampler import Sampled, Sampler
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 from scipy.special import logit
@@ -31,15 +32,8 @@ def seen(load: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sampler(load: float, even: float = 1e12) -> Sampler:
-    ising, (precision, shift) = prior(even), seen(load)
-    return Sampler(
-        stiffness=ising.stiffness,
-        log_odds=ising.log_odds,
-        coupling=ising.coupling,
-        neighbours=ising.neighbours,
-        precision=jnp.asarray(precision),
-        shift=jnp.asarray(shift),
-    )
+    precision, shift = seen(load)
+    return Sampler(prior=prior(even), precision=jnp.asarray(precision), shift=jnp.asarray(shift))
 
 
 def sampled(load: float, rounds: int = ROUNDS, even: float = 1e12) -> Sampled:
@@ -85,7 +79,9 @@ def test_a_chain_that_has_not_seen_enough_says_so():
 def test_a_sweep_keeps_the_moments_up_to_date():
     one = sampler(0.06)
     state = jnp.array([1, 2, 0, 0, 2])
-    after, moments, _ = eqx.filter_jit(one._sweep)(state, one._moments(state), one.stiffness.share, jax.random.key(3))
+    after, moments, _ = eqx.filter_jit(one._sweep)(
+        state, one._moments(state), one.prior.stiffness.share, jax.random.key(3)
+    )
     assert (after != state).any()
     anew = one._moments(after)
     np.testing.assert_allclose(moments.mean, anew.mean, rtol=1e-9, atol=1e-15)

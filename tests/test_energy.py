@@ -57,8 +57,7 @@ def states() -> dict[str, np.ndarray]:
     }
 
 
-SMOOTH = [(name, state) for name in terms() for state in states()]
-"""A flat sheet just touches the bed, where the energy has no second derivative."""
+CASES = [(name, state) for name in terms() for state in states()]
 
 
 def error(found, expected) -> float:
@@ -85,7 +84,7 @@ def derivatives():
     return {name: (term, *compiled(term)) for name, term in terms().items()}
 
 
-@pytest.mark.parametrize(("name", "state"), SMOOTH)
+@pytest.mark.parametrize(("name", "state"), CASES)
 def test_gradient_and_hessian_are_the_energys_own_derivatives(derivatives, name, state):
     """Written out = autodiff of the energy; gradient = central difference of energy, Hessian = that of the gradient."""
     term, energy, by_autodiff, curvature, gradient, hessian, _ = derivatives[name]
@@ -104,7 +103,7 @@ def test_gradient_and_hessian_are_the_energys_own_derivatives(derivatives, name,
     assert error(stiffnesses, hessian(x)) < DIFFERENCE
 
 
-@pytest.mark.parametrize(("name", "state"), [(name, state) for name in terms() for state in states()])
+@pytest.mark.parametrize(("name", "state"), CASES)
 def test_positive_hessian_has_no_negative_eigenvalue(derivatives, name, state):
     term, *_, positive = derivatives[name]
     x = jnp.asarray(states()[state])[term.vertices]

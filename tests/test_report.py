@@ -198,7 +198,7 @@ def test_doubts_are_told_where_there_are_any(tmp_path):
     bad = {"detection": {"converged": False}, "noise": {"force_sd_ratio": 12.04, "position_sd_ratio": 1.2}}
     assert doubts(good) == doubts({"detection": {}}) == []
     rest, forces = doubts(bad)
-    assert "did not come to rest" in rest and "forces are off by 12.0 times" in forces
+    assert "halves of the samples disagree" in rest and "forces are off by 12.0 times" in forces
     run = synthetic()
     parts = {name: run[name] for name in ("sheet", "estimates", "belief")}
     poor = dataclasses.replace(run["detection"], converged=False)

@@ -60,8 +60,8 @@ class Stated(eqx.Module):
     entropy: Float[Array, ""]
     """Of the belief [nat]."""
     converged: Bool[Array, ""]
-    """Whether what was searched (the state of a frame, the belief when the jaws open) came to an end, or was cut off;
-    true where nothing is searched."""
+    """Of a frame, whether the search for its state came to an end, or was cut off; when the jaws open, whether both
+    halves of the samples agree. True where nothing is searched or sampled."""
 
 
 class Update(Stated):

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float, Int
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief, AttachmentPrior
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Stated, Update
 from jiggle_mj.estimator.filters.force_balance import ForceBalance, Information
 from jiggle_mj.estimator.filters.noise import Misfit, Noise
