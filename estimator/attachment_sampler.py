@@ -7,7 +7,7 @@ Statistica Sinica 7:339]. Unlike expectation propagation it finds its way where 
 and has no fixed point to miss. To keep the form closed, the prior's normals are not cut off to [0, 1].
 
 Between two particles that change their state nothing that the others depend on changes, so all are looked at together,
-and a sweep costs a rank-one update for each change.
+and a sweep costs a rank-one update for each change; a few of them wait to be carried out together.
 """
 
 import equinox as eqx
@@ -96,9 +96,7 @@ class Sampler(eqx.Module):
         turn, noise = jax.random.permutation(by_order, n), jax.random.gumbel(by_noise, (len(width), n))
 
         def change(carried):
-            state, moments, weight, at = carried
-            mean, covariance = moments.mean, moments.covariance
-            own = jnp.diagonal(covariance)
+            state, mean, own, pending, weight, at = carried
             apart = 1 / jnp.maximum(1 / own - precision[state], FAINT)
             told = (apart * (mean / own - shift[state]))[None]
             spread = apart[None] + width
@@ -113,16 +111,22 @@ class Sampler(eqx.Module):
             new = jnp.where(until < n, drawn[i], state[i])
             weight = jnp.where(((turn >= at) & (turn <= until))[None], jax.nn.softmax(log_weight, axis=0), weight)
             stiffer, further = precision[new] - precision[state[i]], shift[new] - shift[state[i]]
-            column = covariance[:, i]
-            gain = column / (1 + stiffer * column[i])
-            moments = Moments(
-                mean=mean + gain * (further - stiffer * mean[i]),
-                covariance=covariance - jnp.outer(stiffer * gain, column),
-            )
-            return state.at[i].set(new), moments, weight, until + 1
+            column = pending.column(i)
+            factor = 1 / (1 + stiffer * column[i])
+            mean = mean + factor * (further - stiffer * mean[i]) * column
+            own = own - factor * stiffer * column**2
+            pending = pending.and_less(factor * stiffer, column)
+            return state.at[i].set(new), mean, own, pending, weight, until + 1
+
+        def batch(carried):
+            state, moments, weight, at = carried
+            first = state, moments.mean, jnp.diagonal(moments.covariance), Pending.none(moments.covariance), weight, at
+            some = lambda carried: (carried[-1] < n) & (carried[3].count < PENDING)  # noqa: E731
+            state, mean, _, pending, weight, at = jax.lax.while_loop(some, change, first)
+            return state, Moments(mean=mean, covariance=pending.done()), weight, at
 
         first = state, moments, jnp.zeros((len(width), n)), jnp.asarray(0)
-        return jax.lax.while_loop(lambda carried: carried[-1] < n, change, first)[:3]
+        return jax.lax.while_loop(lambda carried: carried[-1] < n, batch, first)[:3]
 
 
 class Moments(eqx.Module):
@@ -132,6 +136,43 @@ class Moments(eqx.Module):
     covariance: Float[Array, "n n"]
 
 
+class Pending(eqx.Module):
+    """A covariance, and rank-one updates of it to be carried out together.
+
+    One at a time, each would cost the time to read and write all of it.
+    """
+
+    covariance: Float[Array, "n n"]
+    columns: Float[Array, "_k n"]
+    factors: Float[Array, " _k"]
+    count: Int[Array, ""]
+
+    @classmethod
+    def none(cls, covariance: Float[Array, "n n"]) -> "Pending":
+        """Nothing to update."""
+        columns = jnp.zeros((PENDING, len(covariance)))
+        return cls(covariance=covariance, columns=columns, factors=jnp.zeros(PENDING), count=jnp.asarray(0))
+
+    def column(self, i: Int[Array, ""]) -> Float[Array, " n"]:
+        """The i-th, up to date."""
+        return self.covariance[i] - (self.factors * self.columns[:, i]) @ self.columns
+
+    def and_less(self, factor: Float[Array, ""], column: Float[Array, " n"]) -> "Pending":
+        """After taking factor * column column^T away."""
+        return Pending(
+            covariance=self.covariance,
+            columns=self.columns.at[self.count].set(column),
+            factors=self.factors.at[self.count].set(factor),
+            count=self.count + 1,
+        )
+
+    def done(self) -> Float[Array, "n n"]:
+        """The covariance, up to date."""
+        return self.covariance - (self.factors[:, None] * self.columns).T @ self.columns
+
+
+PENDING = 32
+"""Updates that wait for one another."""
 ROUND = 10
 """Sweeps after which the covariance is computed anew, free of what its updates were rounded by."""
 FAINT = 1e-8

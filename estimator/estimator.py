@@ -5,17 +5,21 @@ goes perception -> grip -> filter. Sees nothing but observations, the camera's c
 """
 
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.config import EstimatorConfig
 from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull, Stated
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter
 from jiggle_mj.estimator.grip import GripHold
+from jiggle_mj.estimator.identification import identify
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.perception import Disparity, PointTracker, StereoTracker, TissueMask, Track
 from jiggle_mj.estimator.perception.mesh_field import MeshField
@@ -23,6 +27,7 @@ from jiggle_mj.estimator.perception.mesh_field import MeshField
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.material import Material, material
 from jiggle_mj.mesh_checks import check_unfolded
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
@@ -160,6 +165,27 @@ class Estimator:
             if (again := self._filter.release(self._belief)) is not None:
                 self._believe(again)
                 self._converged = bool(again.converged)
+
+    def identify(self, *, on_pass: Callable[[dict[str, float]], None] = lambda _: None) -> Material:
+        """The sheet's own parameters from all frames so far; the belief becomes the one that goes with them.
+
+        Args:
+            on_pass: told of each ratio's factor after each pass, for progress.
+
+        Raises:
+            ValueError: asked before the first frame with closed jaws, or of another filter than 'implicit'.
+        """
+        self._check_begun()
+        if not (isinstance(self._filter, ImplicitFilter) and isinstance(self._belief, AttachmentBelief)):
+            raise ValueError(f"only the filter 'implicit' can identify the sheet; this one is {self.config.filter!r}.")
+        self.release()
+        with jax.enable_x64(True), one_thread():
+            factors, log_sd, stated, converged = identify(
+                self._filter, self._belief, jnp.asarray(self._b), on_pass=on_pass
+            )
+            self._believe(stated)
+            self._converged = bool(stated.converged)
+        return material(self.declaration, factors, log_sd, converged=converged)
 
     def _update(self, observation: Observation) -> Estimate | None:
         tool = observation.tool

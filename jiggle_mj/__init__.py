@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from jiggle_mj.eval.experiment import run_scene as run_scene
     from jiggle_mj.eval.score import score as score
     from jiggle_mj.importing import import_folder as import_folder
+    from jiggle_mj.material import Material as Material
     from jiggle_mj.observation import Action as Action
     from jiggle_mj.observation import Declaration as Declaration
     from jiggle_mj.observation import DeclaredMesh as DeclaredMesh
@@ -64,6 +65,7 @@ __all__ = [
     "EstimatorConfig",
     "Grasp",
     "JiggleError",
+    "Material",
     "MeasuredPoints",
     "MeshError",
     "Move",
@@ -112,6 +114,7 @@ _NAMES_OF = {
     "eval.experiment": ("run_estimator", "run_scene"),
     "eval.score": ("score",),
     "importing": ("import_folder",),
+    "material": ("Material",),
     "observation": (
         "Action",
         "Declaration",

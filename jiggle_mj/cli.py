@@ -174,6 +174,46 @@ def estimate(
     _show(figures, out, as_json)
 
 
+def identify(recording: PathArgument, /, *, allow_truncated: bool = False, as_json: AsJson = False) -> None:
+    """Weight and bending stiffness of the sheet over its membrane stiffness, from a recording.
+
+    Args:
+        recording: an MCAP file.
+        allow_truncated: use what is whole of a recording that was cut off.
+        as_json: print what was found to stdout.
+    """
+    from jiggle_mj import episode
+    from jiggle_mj.estimator import Estimator
+    from jiggle_mj.recording import Recording
+
+    source = Recording.open(recording, allow_truncated=allow_truncated)
+    estimator = Estimator(source.declaration, source.camera)
+    with _progress(len(source), f"estimate {recording.name}") as on_frame:
+        episode.estimate(source, estimator, on_frame=on_frame)
+    with console.status("weight and bending") as status:
+        material = estimator.identify(
+            on_pass=lambda factors: status.update(", ".join(f"{name} x {x:.3g}" for name, x in factors.items()))
+        )
+    table = Table("over the membrane stiffness", "declared", "found", "standard error", box=None)
+    for name, ratio in material.ratios.items():
+        known = ratio.refused is None
+        found = (f"{ratio.declared * ratio.factor:.3g}", f"{100 * ratio.log_sd:.1f} %") if known else ("-", "-")
+        table.add_row(f"{name} [{ratio.unit}]", f"{ratio.declared:.3g}", *found)
+    console.print(table)
+    for name, why in material.refused.items():
+        console.print(f"{name}: not identified; {why}.", highlight=False)
+    found = material.declaration
+    console.print(
+        f"If the sheet weighs the declared {found.areal_density:g} kg/m^2: membrane_stiffness = "
+        f"{found.membrane_stiffness:.3g} N/m, and thickness = {found.thickness:.3g} m for its bending.",
+        highlight=False,
+    )
+    if as_json:
+        ratios = {name: asdict(ratio) for name, ratio in material.ratios.items()}
+        declared = {name: getattr(found, name) for name in ("membrane_stiffness", "thickness", "areal_density")}
+        print(json.dumps({"ratios": ratios, "refused": material.refused, "declaration": declared}))
+
+
 def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = None, as_json: AsJson = False) -> None:
     """Score an estimate against a truth file, and write the truth into its report.
 
@@ -264,6 +304,7 @@ VERBS = {
     "record": record,
     "import": import_,
     "estimate": estimate,
+    "identify": identify,
     "score": score,
     "table": table,
     "bench": bench,

@@ -9,7 +9,7 @@ With s = b / (b + b_ref), f the gradient of the sheet's own energy and d = x - a
 
 which at s = 1 is a weld, x = a, and stays sensitive there: D = dr/ds = b_ref d - f holds the reaction force. With
 H = dr/dx, W = cov(n_f)^-1 (0 where loaded), A = R^-1 + H^T W H and N^-1 = W - W H A^-1 H^T W, eliminating x leaves for
-s the evidence D^T N^-1 D, with D as far as it is more than its own error (`_calibrated`). Linear in s at the observed
+s the evidence D^T N^-1 D, with D as far as it is more than its own error (`calibrated`). Linear in s at the observed
 state, so the wild response of a free sheet is never needed. Needs correspondences.
 """
 
@@ -100,11 +100,20 @@ class ForceBalance(eqx.Module):
         """With that many times the variance of the unbalanced force."""
         return eqx.tree_at(lambda one: one.force_sd, self, self.force_sd * jnp.sqrt(variance))
 
+    def of(self, energy: SheetEnergy) -> "ForceBalance":
+        """That of the same sheet with other parameters."""
+        return eqx.tree_at(lambda one: (one.energy, one.tethered), self, (energy, Tethered.build(energy)))
+
     def settle(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
         """Equilibrium at fixed s of the sheet tethered to the observed positions, searched from x."""
         b, stiff = self.reference * s / (1 - s), self.grip_stiffness
         sd = self.force_sd
         return self.tethered.settle(b, evidence, x, force_sd=sd, force_tolerance=sd, grip_stiffness=stiff).x
+
+    def predict(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
+        """Equilibrium at fixed s of the sheet that only the grip pulls at, searched from x."""
+        held = jnp.where(evidence.held[:, None, None], evidence.precision, 0.0)
+        return self.settle(x, s, eqx.tree_at(lambda one: one.precision, evidence, held))
 
     def approach(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> "Frame":
         """Linearise where a Gauss-Newton step on the state alone, at fixed s, gains no more than `SETTLED`."""
@@ -163,7 +172,7 @@ class ForceBalance(eqx.Module):
 
     def information(self, frame: "Frame", fit: "Fit") -> "Information":
         """What the frame says of s, with its state eliminated."""
-        layout, w, slope = self.layout, frame.weight, self._calibrated(frame, fit)
+        layout, w, slope = self.layout, frame.weight, self.calibrated(frame, fit)
         whitened = w[:, None] * fit.left
         spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, slope)
         padded = layout.n_blocks * layout.width
@@ -173,6 +182,11 @@ class ForceBalance(eqx.Module):
         precision = jnp.diag(w * jnp.sum(slope**2, axis=1)) - square[layout.slot][:, layout.slot]
         pulled = -jnp.sum(slope * whitened, axis=1)
         return Information(precision=precision, pulled=pulled, squared=jnp.sum(fit.residual * whitened), at=frame.s)
+
+    def whitened(self, frame: "Frame", v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """N^-1 v."""
+        pushed = self._transposed(frame.rows, frame.weight[:, None] * v)
+        return frame.weight[:, None] * (v - self._apply(frame.rows, solve(self.layout, frame.factor, pushed)))
 
     def misfit(self, frame: "Frame", fit: "Fit", evidence: Evidence) -> Misfit:
         """What is left of the frame."""
@@ -188,7 +202,7 @@ class ForceBalance(eqx.Module):
             position_degrees=jnp.sum(jnp.where(free, 3 - seen, 0.0)),
         )
 
-    def _calibrated(self, frame: "Frame", fit: "Fit") -> Float[Array, "n 3"]:
+    def calibrated(self, frame: "Frame", fit: "Fit") -> Float[Array, "n 3"]:
         """D, shrunk towards 0 by the share of |D|^2 that its own error makes up.
 
         D is taken at an estimate of x, whose covariance is A^-1. Where nothing moves D is all error, and as a regressor

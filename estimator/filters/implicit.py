@@ -5,6 +5,7 @@ attachment shows only once its surroundings are believed stiff: when the jaws op
 what is believed now are linearised again, and replace what they said before. Nothing is counted twice.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.attachment_prior import AttachmentPrior
+from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Stated, Update
 from jiggle_mj.estimator.filters.force_balance import ForceBalance, Information
 from jiggle_mj.estimator.filters.noise import Misfit, Noise
@@ -75,6 +77,28 @@ class ImplicitFilter(Filter):
         if self._between:
             return None
         self._between = True
+        return self._judged(belief)
+
+    def of(self, belief: AttachmentBelief, energy: SheetEnergy) -> Stated:
+        """All grasps so far judged again by another energy of the same sheet, the noise learned anew."""
+        self._balance, self._noise = self._balance.of(energy), Noise()
+        for grasp in self._grasps:
+            grasp.noise = None
+        return self._judged(belief)
+
+    @property
+    def energy(self) -> SheetEnergy:
+        """Of the sheet without attachments."""
+        return self._balance.energy
+
+    def frames(self) -> Iterator[tuple[ForceBalance, Evidence, Float[Array, "n 3"]]]:
+        """What was seen so far, with the noise that was learned, and the states found; by which balance."""
+        balance = self._balance.widened(self._noise.force)
+        for grasp in self._grasps:
+            for evidence, x, _ in grasp.frames:
+                yield balance, evidence.widened(self._noise.position), x
+
+    def _judged(self, belief: AttachmentBelief) -> Stated:
         stated = self._settled(_sampled(belief, PASSING), STALE, PASSES)
         for _ in range(PASSES):
             if self._learned() == self._noise:
@@ -122,21 +146,21 @@ class _Grasp:
         self.shift: Float[Array, " n"] | float = 0.0
         self.misfit: Misfit | None = None
         """What they leave unexplained, if they were linearised again."""
-        self._frames: list[tuple[Evidence, Float[Array, "n 3"], Float[Array, " n"]]] = []
+        self.frames: list[tuple[Evidence, Float[Array, "n 3"], Float[Array, " n"]]] = []
         """What was seen, the state, and the s of the linearisation."""
 
     def take(self, evidence: Evidence, x: Float[Array, "n 3"], found: Information) -> None:
-        self._frames.append((evidence, x, found.at))
+        self.frames.append((evidence, x, found.at))
         self.precision, self.shift = self.precision + found.precision, self.shift + found.shift
 
     def distance(self, s: Float[Array, " n"]) -> float:
         """How far s is from where a frame was linearised."""
-        return max(float(jnp.max(jnp.abs(s - at))) for _, _, at in self._frames)
+        return max(float(jnp.max(jnp.abs(s - at))) for _, _, at in self.frames)
 
     def again(self, balance: ForceBalance, s: Float[Array, " n"], noise: Noise) -> "_Grasp":
         """The same frames, linearised at s for a noise."""
         grasp, balance = _Grasp(noise), balance.widened(noise.force)
-        for evidence, x, _ in self._frames:
+        for evidence, x, _ in self.frames:
             x, found, misfit = _information(balance, x, s, evidence.widened(noise.position))
             grasp.take(evidence, x, found)
             grasp.misfit = misfit if grasp.misfit is None else grasp.misfit + misfit
