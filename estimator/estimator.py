@@ -15,13 +15,15 @@ from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.config import EstimatorConfig
+from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull, Stated
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
 from jiggle_mj.estimator.grip import GripHold
 from jiggle_mj.estimator.identification import identify
 from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.perception import Disparity, PointTracker, StereoTracker, TissueMask, Track
+from jiggle_mj.estimator.perception import CloudTracker, Disparity, PointTracker, StereoTracker, TissueMask, Track
+from jiggle_mj.estimator.perception.cloud_tracker import lay_mesh
 from jiggle_mj.estimator.perception.mesh_field import MeshField
 
 from jiggle_mj.camera import StereoCamera
@@ -66,6 +68,7 @@ class Estimator:
             else StereoTracker(camera, spacing=self.config.spacing, mask=mask, disparity=disparity)
         )
         self._points = PointTracker(declaration.mesh)
+        self._clouds: CloudTracker | None = None
         self._still: list[MeasuredPoints] = []
         self._sheet: Sheet | None = None
         self._filter: Filter | None = None
@@ -266,7 +269,7 @@ class Estimator:
     def _begin(self) -> Filter:
         """Build the model once the rest shape is known."""
         if self._sheet is None:
-            self._sheet = self._points.start(self._still)
+            self._sheet = self._rest_of_points()
         mesh, plane = SheetMesh(self._sheet.rest, self._sheet.faces), SheetPlane.through(self._sheet.rest)
         check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
         self._field = MeshField(plane.flatten(mesh.rest), mesh.faces)
@@ -275,10 +278,37 @@ class Estimator:
         self._x, self._b, self._probability = mesh.rest, np.zeros(mesh.n), np.full(mesh.n, np.nan)
         return found
 
+    def _rest_of_points(self) -> Sheet:
+        """The sheet at rest, as points with identities show it, or clouds without."""
+        if all(points.track_id is not None for points in self._still):
+            return self._points.start(self._still)
+        declared = self.declaration.mesh
+        sheet = (
+            lay_mesh(self._still, spacing=self.config.spacing)
+            if declared is None
+            else Sheet(rest=declared.vertices, faces=declared.faces)
+        )
+        self._clouds = CloudTracker(sheet, self.declaration)
+        return sheet
+
+    def _meet(self, points: MeasuredPoints, tool: ToolState) -> Track:
+        """A cloud without identities, from the state before, the tip having moved."""
+        assert self._clouds is not None
+        hold, before = self._grip(Track.of_nothing(len(self._x)), tool)
+        grip = Grip(
+            vertices=np.arange(len(before))[:, None],
+            tip=jnp.asarray(tool.position),
+            length=jnp.asarray(np.linalg.norm(hold.closed_at - hold.tip, axis=1)),
+            stiffness=jnp.where(hold.held, self.config.grip_stiffness * self.declaration.membrane_stiffness, 0.0),
+        )
+        return self._clouds.track(points, before, self._b, grip)
+
     def _see(self, observation: Observation) -> Track:
         if observation.images is not None and self._stereo is not None:
             return self._stereo.track(observation.images, observation.tool, predicted=self._x)
         if observation.points is not None:
+            if self._clouds is not None:
+                return self._meet(observation.points, observation.tool)
             return self._points.track(observation.points)
         raise PerceptionError(f"observation {observation.index} has neither points nor images; one is needed.")
 

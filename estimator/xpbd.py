@@ -15,6 +15,8 @@ swept to the end is one step of implicit Euler, but for springs that turn on the
 in many steps and `equilibrium` directly.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,6 +25,8 @@ from jaxtyping import Array, Float, Int
 from jiggle_mj.estimator.environment import Grip, lengths
 from jiggle_mj.estimator.membrane import EdgeMembrane
 from jiggle_mj.estimator.mesh import SheetMesh
+
+Residual = Callable[[Float[Array, "n 3"]], Float[Array, "n 3"]]
 
 
 class XPBD(eqx.Module):
@@ -77,7 +81,13 @@ class XPBD(eqx.Module):
         )
 
     def step(
-        self, x: Float[Array, "n 3"], b: Float[Array, " n"], grip: Grip | None = None, *, sweeps: int
+        self,
+        x: Float[Array, "n 3"],
+        b: Float[Array, " n"],
+        grip: Grip | None = None,
+        *,
+        sweeps: int,
+        residual: Residual | None = None,
     ) -> Float[Array, "n 3"]:
         """f(x_t, u, b): one step from x_t, differentiable by unrolling in all but `sweeps`.
 
@@ -86,8 +96,9 @@ class XPBD(eqx.Module):
             b: stiffness of the boundary springs [N/m].
             grip: C_a with the tip at u; None for open jaws.
             sweeps: of Gauss-Seidel.
+            residual: moves the particles once a sweep beside the constraints: the paper's f', matched to a cloud.
         """
-        return self._sweeps(self._fall(x), self._slack(x), b, grip, sweeps)[0]
+        return self._sweeps(self._fall(x), self._slack(x), b, grip, sweeps, residual)[0]
 
     def settle(
         self, x: Float[Array, "n 3"], b: Float[Array, " n"], grip: Grip | None = None, *, sweeps: int, steps: int
@@ -127,11 +138,12 @@ class XPBD(eqx.Module):
             impulse = impulse + _direction(x - grip.tip[None])[0] * of_grip[:, None]
         return start + w * impulse
 
-    def _sweeps(self, start, multipliers, b, grip, number: int):
+    def _sweeps(self, start, multipliers, b, grip, number: int, residual: Residual | None = None):
         """A number of sweeps, and the multipliers that they leave."""
 
         def one(state, _):
             x, multipliers = state
+            x = x if residual is None else x + residual(x)
             return self._sweep(x, multipliers, b, grip), None
 
         return jax.lax.scan(one, (start, multipliers), length=number)[0]

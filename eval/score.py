@@ -50,7 +50,7 @@ def result(
     Args:
         scene: name of the scene or recording.
         seed: of the run.
-        sensing: stereo, points or particles.
+        sensing: stereo, points, particles or cloud.
         estimator: implicit, explicit or adam.
         policy: who chose the pulls.
         sheet: the estimator's particles.

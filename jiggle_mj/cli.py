@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jiggle_mj.estimate import Estimate
     from jiggle_mj.observation import Observation
 
-Sensing = Literal["stereo", "points", "particles"]
+Sensing = Literal["stereo", "points", "particles", "cloud"]
 FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
 PathArgument = Annotated[Path, tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
@@ -50,7 +50,8 @@ def run(
     Args:
         scene: a shipped scene (arc, line, ...) or the path of a scene file.
         out: folder for run.mcap, run.truth.mcap, estimate.mcap, result.json and report.html.
-        sensing: what the estimator sees: images; noisy tracked points of the tissue; noisy vertices of the reference.
+        sensing: what the estimator sees: images; noisy tracked points of the tissue; noisy vertices of the reference; a
+            noisy cloud of other points in each frame.
         estimator: implicit is ours; explicit is the paper's filter, adam its baseline; nnls and unscented are others'.
         seed: of the sensing noise.
         overwrite: replace results that are already in the folder, from the moment that the run begins.
@@ -194,11 +195,11 @@ def identify(recording: PathArgument, /, *, allow_truncated: bool = False, as_js
         material = estimator.identify(
             on_pass=lambda factors: status.update(", ".join(f"{name} x {x:.3g}" for name, x in factors.items()))
         )
-    table = Table("over the membrane stiffness", "declared", "found", "standard error", box=None)
+    table = Table("over the membrane stiffness", "unit", "declared", "found", "standard error", box=None)
     for name, ratio in material.ratios.items():
         known = ratio.refused is None
         found = (f"{ratio.declared * ratio.factor:.3g}", f"{100 * ratio.log_sd:.1f} %") if known else ("-", "-")
-        table.add_row(f"{name} [{ratio.unit}]", f"{ratio.declared:.3g}", *found)
+        table.add_row(name, ratio.unit, f"{ratio.declared:.3g}", *found)
     console.print(table)
     for name, why in material.refused.items():
         console.print(f"{name}: not identified; {why}.", highlight=False)

@@ -25,7 +25,7 @@ from jiggle_mj.errors import ActionError, SceneError
 from jiggle_mj.observation import Action, Declaration, Grasp, Move, Observation, Release, ToolState, Wait
 from jiggle_mj.truth import Truth, TruthFrame
 
-Sensing = Literal["stereo", "points", "particles"]
+Sensing = Literal["stereo", "points", "particles", "cloud"]
 SENSING: tuple[Sensing, ...] = get_args(Sensing)
 OPEN_ANGLE, CLOSED_ANGLE = 0.25, 0.0
 """Of each jaw [rad]."""
@@ -63,6 +63,7 @@ class Reference:
             "particles": lambda: sense.vertex_tracks(self._tissue.sheet, rng=self._rng),
             "points": lambda: sense.material_tracks(self._tissue.sheet, n_points=scene.sensing.n_points, rng=self._rng),
             "stereo": lambda: None,
+            "cloud": lambda: None,
         }[sensing]()
         self._index, self._grasp, self._radius, self._closed = -1, 0, scene.tweezer.radius, False
         self.capped: list[int] = []
@@ -255,8 +256,12 @@ class Reference:
         images = points = None
         if self._renderer is not None:
             images = sense.add_image_noise(self._renderer.render(self._data), sd=settings.image_sd, rng=self._rng)
-        if self._tracks is not None:
-            points = sense.measure(self._tracks.positions(self._surface()), sd=settings.point_sd, rng=self._rng)
+        tracks, tracked = self._tracks, self._tracks is not None
+        if self.sensing == "cloud":
+            tracks = sense.surface_points(self._tissue.sheet, n_points=settings.cloud_points, rng=self._rng)
+        if tracks is not None:
+            positions = tracks.positions(self._surface())
+            points = sense.measure(positions, sd=settings.point_sd, rng=self._rng, tracked=tracked)
         return Observation(index=self._index, time=self._time, tool=self._tool(), images=images, points=points)
 
     def _tool(self) -> ToolState:

@@ -129,6 +129,8 @@ class Sensing(Section):
     """Standard deviation of each coordinate of a measured point [m]."""
     n_points: int = integer(600, at_least=10, at_most=100000)
     """Tracked material points of `sensing = points`."""
+    cloud_points: int = integer(3000, at_least=10, at_most=100000)
+    """Points of each frame of `sensing = cloud`."""
     image_sd: float = number(2.0, unit="grey levels", at_least=0, at_most=100)
 
 

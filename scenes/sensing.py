@@ -1,7 +1,8 @@
-"""What the estimator is given instead of the truth: noisy particles, noisy material points, noisy images.
+"""What the estimator is given instead of the truth: noisy particles, noisy material points, noisy clouds, noisy images.
 
 `particles` are the mesh's vertices in a shuffled order that says nothing of the mesh; `points` are material points
-between them, spread evenly. Each track id means one material point for the whole run.
+between them, spread evenly. Each track id means one material point for the whole run. A `cloud` has no identities:
+its points are other ones in each frame.
 """
 
 from dataclasses import dataclass
@@ -51,6 +52,15 @@ def material_tracks(sheet: Triangulation, *, n_points: int, rng: np.random.Gener
     return Tracks(corners=sheet.faces[triangle[kept]], weights=weights[rows, triangle][kept])
 
 
+def surface_points(sheet: Triangulation, *, n_points: int, rng: np.random.Generator) -> Tracks:
+    """Points anywhere on the sheet, evenly by its area at rest."""
+    a, b, c = (sheet.vertices[sheet.faces[:, k]] for k in range(3))
+    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    area = np.abs(ux * vy - uy * vx)
+    triangle = rng.choice(len(sheet.faces), n_points, p=area / area.sum())
+    return Tracks(corners=sheet.faces[triangle], weights=rng.dirichlet(np.ones(3), n_points))
+
+
 def barycentric(sheet: Triangulation, places: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m f 3"]:
     """Coordinates of every place in every triangle."""
     a, b, c = (sheet.vertices[sheet.faces[:, k]] for k in range(3))
@@ -59,10 +69,12 @@ def barycentric(sheet: Triangulation, places: Float[np.ndarray, "m 2"]) -> Float
     return np.concatenate([1 - inner.sum(axis=2, keepdims=True), inner], axis=2)
 
 
-def measure(positions: Float[np.ndarray, "m 3"], *, sd: float, rng: np.random.Generator) -> MeasuredPoints:
+def measure(
+    positions: Float[np.ndarray, "m 3"], *, sd: float, rng: np.random.Generator, tracked: bool
+) -> MeasuredPoints:
     """Add white noise of standard deviation `sd` [m] to each coordinate."""
     noisy = positions + sd * rng.standard_normal(positions.shape)
-    return MeasuredPoints(positions=noisy, track_id=np.arange(len(positions)), sd=sd)
+    return MeasuredPoints(positions=noisy, track_id=np.arange(len(positions)) if tracked else None, sd=sd)
 
 
 def add_image_noise(pair: StereoPair, *, sd: float, rng: np.random.Generator) -> StereoPair:

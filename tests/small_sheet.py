@@ -162,6 +162,14 @@ def nees(belief: AttachmentBelief) -> float:
     return found
 
 
+def cloud(x: np.ndarray, seed: int, sd: float) -> np.ndarray:
+    """1500 points anywhere on the sheet at x, with noise, in no order."""
+    rng = np.random.default_rng(seed)
+    corner = sheet().faces[rng.integers(len(sheet().faces), size=1500)]
+    weights = rng.dirichlet(np.ones(3), len(corner))
+    return np.einsum("pk,pki->pi", weights, x[corner]) + sd * rng.normal(size=(len(corner), 3))
+
+
 def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:
     """Noisy positions, and held particles as the tip says."""
     noisy = frame.x + NOISE * np.random.default_rng(seed).normal(size=frame.x.shape)

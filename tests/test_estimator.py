@@ -4,10 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+import trimesh
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import Track
 from perception_plane import camera
-from small_sheet import DECLARATION, GRIP_RADIUS, SPACING, attached, lifts, sheet
+from small_sheet import DECLARATION, GRIP_RADIUS, SPACING, attached, cloud, lifts, sheet
 
 from jiggle_mj.errors import MeshError, PerceptionError, RecordingError
 from jiggle_mj.observation import DeclaredMesh, MeasuredPoints, Observation, StereoPair, ToolState
@@ -121,11 +122,18 @@ def test_nan_points_are_unseen_particles():
     assert np.linalg.norm(lifts()[1].x - lifts()[2].x, axis=1)[hidden].max() > 2e-3
 
 
-def test_a_cloud_without_identities_is_refused():
-    estimator = Estimator(DECLARATION)
-    with pytest.raises(PerceptionError, match="carry no track_id"):
-        for one in episode()[:3]:
-            estimator.update(with_points(one, track_id=None))
+def test_clouds_without_identities_are_followed_by_a_mesh_of_the_estimators_own():
+    """Against the same surface without noise."""
+    estimator, states = Estimator(DECLARATION, config=EstimatorConfig(spacing=SPACING)), [sheet().rest] * 2
+    states += [lift.x for lift in lifts()]
+    found = [
+        estimator.update(with_points(one, track_id=None, positions=cloud(states[i], i, NOISE)))
+        for i, one in enumerate(episode()[:6])
+    ][-1]
+    assert np.nanmax(np.linalg.norm(found.observed - estimator.sheet.rest, axis=1)) > 0.01
+    surface = trimesh.Trimesh(states[5], sheet().faces, process=False)
+    off = trimesh.proximity.closest_point_naive(surface, found.observed[np.isfinite(found.observed).all(axis=1)])[1]
+    assert len(estimator.sheet.rest) != sheet().n and np.sqrt(np.mean(off**2)) < 5e-4
 
 
 def test_two_sheets_of_points_are_refused():

@@ -219,6 +219,17 @@ def test_measured_points_keep_their_ids_and_carry_the_stated_noise(sensing):
     assert reference.camera is None
 
 
+def test_a_cloud_shows_other_points_of_the_surface_in_each_frame():
+    reference = Reference(SCENE, seed=0, sensing="cloud")
+    clouds = [reference.step(Wait()).points for _ in range(2)]
+    surface = reference.truth_frame().positions
+    for cloud in clouds:
+        assert cloud.track_id is None and len(cloud.positions) == SCENE.sensing.cloud_points
+        assert np.abs(cloud.positions[:, 2] - surface[:, 2].mean()).max() < 6 * cloud.sd
+        np.testing.assert_allclose(np.ptp(cloud.positions, axis=0)[:2], np.ptp(surface, axis=0)[:2], atol=2e-3)
+    assert np.linalg.norm(clouds[0].positions - clouds[1].positions, axis=1).mean() > 5e-3
+
+
 def test_particles_are_the_vertices_in_another_order():
     reference = particles()
     observation, frame = reference.step(Wait()), reference.truth_frame()

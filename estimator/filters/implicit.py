@@ -33,7 +33,7 @@ make it even, so that a free and an attached stretch are equally likely beforeha
 find everything attached where little is known, or nothing."""
 SWEEPS = 2
 """Of expectation propagation after a frame."""
-BURN_IN, PASSING, SAMPLES = 1, 2, 8
+BURN_IN, PASSING, SAMPLES = 3, 6, 40
 """Rounds of samples when the jaws open: left out, kept while grasps are linearised again, and kept at the end."""
 STALE = 0.1
 """A grasp is linearised again when some s has moved further than this from where it was."""

@@ -4,10 +4,20 @@ Data flow: `rectified` -> `tissue_mask`, `disparity` -> `sheet_mesh` -> (`materi
 `registration` (with `lucas_kanade`) -> `stereo_tracker`, which holds it together.
 """
 
+from jiggle_mj.estimator.perception.cloud_tracker import CloudTracker
 from jiggle_mj.estimator.perception.disparity import Disparity, SemiGlobalMatching
 from jiggle_mj.estimator.perception.point_tracker import PointTracker
 from jiggle_mj.estimator.perception.stereo_tracker import StereoTracker
 from jiggle_mj.estimator.perception.tissue_mask import TissueMask, WarmTissue
 from jiggle_mj.estimator.perception.track import Track
 
-__all__ = ["Disparity", "PointTracker", "SemiGlobalMatching", "StereoTracker", "TissueMask", "Track", "WarmTissue"]
+__all__ = [
+    "CloudTracker",
+    "Disparity",
+    "PointTracker",
+    "SemiGlobalMatching",
+    "StereoTracker",
+    "TissueMask",
+    "Track",
+    "WarmTissue",
+]

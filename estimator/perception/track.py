@@ -23,6 +23,12 @@ class Track:
     uvd: Float[np.ndarray, "n 3"] | None = None
     """Left rectified pixel and disparity [px], the best guess where unseen; None without images."""
 
+    @classmethod
+    def of_nothing(cls, n: int) -> "Track":
+        """Of a frame in which no particle was seen."""
+        covariance = np.broadcast_to(UNSEEN_VARIANCE * np.eye(3), (n, 3, 3))
+        return cls(positions=np.full((n, 3), np.nan), covariance=covariance, visible=np.zeros(n, bool))
+
     def __post_init__(self) -> None:
         """Check the covariances."""
         turned = self.covariance.transpose(0, 2, 1)
