@@ -26,7 +26,7 @@ demo: $(SET_UP)
 	$(BIN)/jiggle-mj run arc --out out/demo --overwrite
 
 test: $(SET_UP)
-	$(BIN)/pytest -m "not slow" -n 2
+	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
 
 slow: $(SET_UP)
 	$(BIN)/pytest -m slow

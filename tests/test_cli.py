@@ -1,6 +1,7 @@
 """The command line: exit codes, what goes to stdout, what is refused, and one whole run."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -86,10 +87,22 @@ def test_a_folder_with_results_is_refused_with_2_and_replaced_on_demand(whole, t
     assert "pass --overwrite" in capsys.readouterr().err
     assert (made / "result.json").read_bytes() == before
     out = tmp_path / "old"
-    out.mkdir()
+    shutil.copytree(made, out)
     (out / "result.json").write_text("old")
-    assert call(monkeypatch, "estimate", made / "run.mcap", "--out", out, "--overwrite") == 0
+    assert call(monkeypatch, "estimate", out / "run.mcap", "--out", out, "--overwrite") == 0
     assert keys(json.loads((out / "result.json").read_text())) == KEYS
+    assert (out / "run.mcap").exists() and (out / "run.truth.mcap").exists()
+
+
+def test_identify_prints_ratios_and_what_it_refuses(whole, monkeypatch, capsys):
+    assert call(monkeypatch, "identify", whole[2] / "run.mcap", "--json") == 0
+    told = capsys.readouterr()
+    found = json.loads(told.out)
+    assert set(found["ratios"]) == {"weight", "bending"} and "membrane stiffness" in found["refused"]
+    for name, ratio in found["ratios"].items():
+        assert ratio["factor"] > 0 and ratio["log_sd"] > 0
+        assert (ratio["refused"] is not None) == (name in found["refused"])
+    assert "membrane stiffness: not identified" in told.err and "1/m" in told.err
 
 
 def test_a_run_that_cannot_begin_leaves_the_old_results(whole, monkeypatch, capsys):

@@ -12,6 +12,7 @@ FORCE_SD = 1e-4
 """[N]; small, as the data come from the filter's own model."""
 SOFT_TO_RIGID = (STIFFNESS, 10 * STIFFNESS, np.inf)
 """0.1 and 1 times the membrane stiffness, and a weld [N/m]."""
+SEEDS = range(3)
 
 
 def implicit() -> ImplicitFilter:
@@ -25,7 +26,8 @@ def run(frames: tuple[Lift, ...], seed: int):
 
 @pytest.fixture(scope="module")
 def runs():
-    return {stiffness: run(lifts(stiffness), 0) for stiffness in SOFT_TO_RIGID}
+    """Several seeds of each: what is held rigidly shows itself in some more than in others."""
+    return {stiffness: [run(lifts(stiffness), seed) for seed in SEEDS] for stiffness in SOFT_TO_RIGID}
 
 
 @pytest.mark.parametrize("stiffness", SOFT_TO_RIGID)
@@ -34,13 +36,13 @@ def test_the_attached_particles_are_found_and_no_others(runs, stiffness):
 
     Beside a weld hardly anything moves, so that single neighbours may pass for held, and some of its rim may not.
     """
-    _, said = runs[stiffness]
-    found, around = np.asarray(said.probability) > 0.5, rim()
-    assert (found & around).sum() >= (0.9 if stiffness <= STIFFNESS else 0.6) * around.sum()
-    assert np.asarray(said.probability)[around].mean() > 0.6
+    probability, around = np.array([said.probability for _, said in runs[stiffness]]), rim()
+    found = probability > 0.5
+    assert found[:, around].mean() >= (0.9 if stiffness <= STIFFNESS else 0.6)
+    assert probability[:, around].mean() > 0.6
     assert not (found & ~dilate(attached(), sheet().faces, 1)).any()
     if stiffness <= STIFFNESS:
-        assert (found != attached()).sum() <= 1
+        assert ((found != attached()).sum(axis=1) <= 1).all()
 
 
 def rim() -> np.ndarray:
@@ -53,12 +55,11 @@ def rim() -> np.ndarray:
 @pytest.mark.parametrize("stiffness", SOFT_TO_RIGID)
 def test_intervals_hold_the_truth(runs, stiffness):
     """Nine tenths are stated, over all particles; most of those of a weld are open-ended."""
-    belief = runs[stiffness][1].belief
-    lower, upper = (np.asarray(end) for end in belief.interval())
+    lower, upper = np.moveaxis([said.belief.interval() for _, said in runs[stiffness]], 1, 0)
     truth = np.where(attached(), stiffness, 0.0)
     holds = (lower <= truth) & (truth <= upper)
     assert holds.mean() >= 0.9
-    assert np.isinf(upper[attached()]).mean() > 0.5 or np.isfinite(stiffness)
+    assert np.isinf(upper[:, attached()]).mean() > 0.5 or np.isfinite(stiffness)
 
 
 def test_a_free_sheet_has_no_attachment():
@@ -69,11 +70,11 @@ def test_a_free_sheet_has_no_attachment():
 
 def test_errors_are_as_large_as_stated(runs):
     """NEES per degree of freedom of s where the truth is no bound of it."""
-    assert 0.3 < nees(runs[STIFFNESS][1].belief) < 2
+    assert 0.3 < np.mean([nees(said.belief) for _, said in runs[STIFFNESS]]) < 2
 
 
 def test_innovations_are_as_large_as_stated(runs):
-    assert all(0.5 < float(out.nis) < 1.5 for out, _ in runs.values())
+    assert all(0.5 < float(out.nis) < 1.5 for several in runs.values() for out, _ in several)
 
 
 def test_the_state_is_closer_to_the_truth_than_what_was_seen():
