@@ -140,3 +140,15 @@ def test_thinning_keeps_points_apart_and_leaves_no_hole():
 def test_too_few_points_are_refused():
     with pytest.raises(PerceptionError, match=r"a sheet needs 20 \(more points, or a smaller"):
         lay_mesh([measured(sheet().rest, 0)], spacing=0.05)
+    nothing = MeasuredPoints(positions=np.full((100, 3), np.nan), sd=SD)
+    with pytest.raises(PerceptionError, match="have 0 points at most; a sheet needs 20"):
+        lay_mesh([nothing], spacing=SPACING)
+    rest = [nothing, measured(sheet().rest, 0)]
+    np.testing.assert_array_equal(lay_mesh(rest, spacing=SPACING).rest, lay_mesh(rest[1:], spacing=SPACING).rest)
+
+
+def test_a_cloud_of_nothing_shows_nothing():
+    tracker = CloudTracker(Sheet(rest=sheet().rest, faces=sheet().faces), DECLARATION)
+    nothing = MeasuredPoints(positions=np.full((100, 3), np.nan), sd=SD)
+    grip = Grip.build(jnp.asarray(sheet().rest), jnp.asarray(corners()[0]), radius=GRIP_RADIUS, stiffness=90.0)
+    assert not tracker.track(nothing, sheet().rest, np.zeros(sheet().n), grip).visible.any()

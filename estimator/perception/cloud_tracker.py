@@ -51,15 +51,18 @@ SLIDE = 5e-3
 
 
 def lay_mesh(still: list[MeasuredPoints], *, spacing: float) -> Sheet:
-    """A mesh over clouds of the sheet at rest: points of the first, thinned from the outline on, at the height of all.
+    """A mesh over clouds of the sheet at rest: points of the largest, thinned from the outline on, at all their height.
 
     Raises:
         PerceptionError: too small a sheet for the spacing.
         MeshError: two sheets.
     """
     clouds = [one.positions[np.isfinite(one.positions).all(axis=1)] for one in still]
+    largest = max(clouds, key=len)
+    if len(largest) < FEWEST:
+        raise PerceptionError(f"the clouds at rest have {len(largest)} points at most; a sheet needs {FEWEST}.")
     plane = SheetPlane.through(np.concatenate(clouds))
-    flat = plane.flatten(clouds[0])
+    flat = plane.flatten(largest)
     flat = np.concatenate([flat[on_outline := outline(flat, spacing)], flat[~on_outline]])
     chosen = flat[thinned(flat, THINNED * spacing)]
     if len(chosen) < FEWEST:
@@ -112,6 +115,8 @@ class CloudTracker:
     ) -> Track:
         """Meet one cloud from the state before it, the tip having moved, with attachments b [N/m]."""
         cloud = points.positions[np.isfinite(points.positions).all(axis=1)]
+        if not len(cloud):
+            return Track.of_nothing(len(before))
         cloud = cloud[np.linspace(0, len(cloud), min(len(cloud), SAMPLES), endpoint=False).astype(int)]
         filled = np.full((SAMPLES, 3), np.nan)
         filled[: len(cloud)] = cloud
