@@ -203,15 +203,16 @@ class ForceBalance(eqx.Module):
         )
 
     def calibrated(self, frame: "Frame", fit: "Fit") -> Float[Array, "n 3"]:
-        """D, shrunk towards 0 by the share of |D|^2 that its own error makes up.
+        """D, shrunk towards 0 by `DOUBT` times the share of |D|^2 that its own error makes up.
 
         D is taken at an estimate of x, whose covariance is A^-1. Where nothing moves D is all error, and as a regressor
-        would pull s wherever the error points; its expectation given what was estimated does not [regression
-        calibration: Carroll et al. 2006, doi:10.1201/9781420010138].
+        would pull s towards where it was linearised; its expectation given what was estimated does not [regression
+        calibration: Carroll et al. 2006, doi:10.1201/9781420010138]. The share is known in the mean alone: in one frame
+        |D|^2 of an error of three components exceeds its mean by chance, and what that leaves adds up over the frames.
         """
         error = window_sums(self.layout, fit.covariance, self.places, frame.turn)
         squared = jnp.sum(frame.slope**2, axis=1)
-        return jnp.maximum(1 - error / jnp.maximum(squared, 1e-30), 0.0)[:, None] * frame.slope
+        return jnp.maximum(1 - DOUBT * error / jnp.maximum(squared, 1e-30), 0.0)[:, None] * frame.slope
 
     def _weight(self, s: Float[Array, " n"], evidence: Evidence) -> Float[Array, " n"]:
         variance = ((1 - s) * self.force_sd) ** 2 + (s * self.reference * self.anchor_sd) ** 2
@@ -321,6 +322,9 @@ class Information(eqx.Module):
         return self.pulled + self.precision @ self.at
 
 
+DOUBT = 3.0
+"""A slope no larger than this many times its expected error says nothing. With 1, particles shielded inside a rigid
+patch, of which nothing can be known, are surely called free."""
 SETTLED = 0.5
 """A step that lowers the cost by less than this share ends the search for the state."""
 STATE_STEPS = 8
