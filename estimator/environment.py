@@ -108,12 +108,12 @@ class Grip(Term):
     def build(cls, x: Float[Array, "n 3"], tip: Float[Array, " 3"], *, radius: float, stiffness: float) -> "Grip":
         """Close the jaws at `tip` around the particles x within the radius."""
         length = jnp.linalg.norm(x - tip[None], axis=1)
-        return cls(
-            vertices=np.arange(len(x))[:, None],
-            tip=tip,
-            length=length,
-            stiffness=jnp.where(length <= radius, stiffness, 0.0),
-        )
+        return cls.of(tip, length, jnp.where(length <= radius, stiffness, 0.0))
+
+    @classmethod
+    def of(cls, tip: Float[Array, " 3"], length: Float[Array, " n"], stiffness: Float[Array, " n"]) -> "Grip":
+        """Springs to a tip that has moved since the jaws closed."""
+        return cls(vertices=np.arange(len(length))[:, None], tip=tip, length=length, stiffness=stiffness)
 
     def _stretch(self, x: Float[Array, "n 1 3"]) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
         d = x[:, 0] - self.tip[None]

@@ -295,13 +295,9 @@ class Estimator:
         """A cloud without identities, from the state before, the tip having moved."""
         assert self._clouds is not None
         hold, before = self._grip(Track.of_nothing(len(self._x)), tool)
-        grip = Grip(
-            vertices=np.arange(len(before))[:, None],
-            tip=jnp.asarray(tool.position),
-            length=jnp.asarray(np.linalg.norm(hold.closed_at - hold.tip, axis=1)),
-            stiffness=jnp.where(hold.held, self.config.grip_stiffness * self.declaration.membrane_stiffness, 0.0),
-        )
-        return self._clouds.track(points, before, self._b, grip)
+        stiffness = jnp.where(hold.held, self.config.grip_stiffness * self.declaration.membrane_stiffness, 0.0)
+        pull = _pull(before, tool, hold)
+        return self._clouds.track(points, before, self._b, Grip.of(pull.tip, pull.length, stiffness))
 
     def _see(self, observation: Observation) -> Track:
         if observation.images is not None and self._stereo is not None:
@@ -353,11 +349,7 @@ class Estimator:
             precision=jnp.asarray(precision),
             held=jnp.asarray(held),
             loaded=jnp.asarray(self._field.widened(held)),
-            pull=Pull(
-                before=jnp.asarray(before),
-                tip=jnp.asarray(tool.position),
-                length=jnp.asarray(np.linalg.norm(hold.closed_at - hold.tip, axis=1)),
-            ),
+            pull=_pull(before, tool, hold),
         )
         return evidence, start
 
@@ -368,3 +360,9 @@ class Estimator:
         if tool.held_tracks:
             return np.isin(self._points.ids, tool.held_tracks)
         return None if self.declaration.mesh is None else self.declaration.mesh.held
+
+
+def _pull(before: Float[np.ndarray, "n 3"], tool: ToolState, hold: GripHold) -> Pull:
+    """The step of the tool that led to a frame."""
+    length = np.linalg.norm(hold.closed_at - hold.tip, axis=1)
+    return Pull(before=jnp.asarray(before), tip=jnp.asarray(tool.position), length=jnp.asarray(length))

@@ -256,12 +256,12 @@ class Reference:
         images = points = None
         if self._renderer is not None:
             images = sense.add_image_noise(self._renderer.render(self._data), sd=settings.image_sd, rng=self._rng)
-        tracks, tracked = self._tracks, self._tracks is not None
-        if self.sensing == "cloud":
+        tracks, cloud = self._tracks, self.sensing == "cloud"
+        if cloud:
             tracks = sense.surface_points(self._tissue.sheet, n_points=settings.cloud_points, rng=self._rng)
         if tracks is not None:
             positions = tracks.positions(self._surface())
-            points = sense.measure(positions, sd=settings.point_sd, rng=self._rng, tracked=tracked)
+            points = sense.measure(positions, sd=settings.point_sd, rng=self._rng, tracked=not cloud)
         return Observation(index=self._index, time=self._time, tool=self._tool(), images=images, points=points)
 
     def _tool(self) -> ToolState:

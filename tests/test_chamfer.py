@@ -68,12 +68,7 @@ def met():
     corner, x, tracks = corners()[0], sheet().rest, []
     length = jnp.asarray(np.linalg.norm(x - corner, axis=1))
     for seed, frame in enumerate(lifts()[1:4]):
-        grip = Grip(
-            vertices=np.arange(sheet().n)[:, None],
-            tip=jnp.asarray(frame.tip),
-            length=length,
-            stiffness=jnp.where(length <= GRIP_RADIUS, 90.0, 0.0),
-        )
+        grip = Grip.of(jnp.asarray(frame.tip), length, jnp.where(length <= GRIP_RADIUS, 90.0, 0.0))
         tracks.append(tracker.track(measured(frame.x, seed), x, 3.0 * attached(), grip))
         x = tracks[-1].positions
     return tracks

@@ -80,7 +80,7 @@ def simulator(mesh: SheetMesh, declaration: Declaration) -> XPBD:
 
 def predicted(simulator: XPBD, shot: Shots, b: Float[Array, " n"], *, sweeps: int) -> Float[Array, "n 3"]:
     """f(x_m, u_m, b) of one sample, whose arrays lack the leading axis."""
-    grip = Grip(vertices=np.arange(len(b))[:, None], tip=shot.tip, length=shot.length, stiffness=shot.stiffness)
+    grip = Grip.of(shot.tip, shot.length, shot.stiffness)
     return simulator.step(shot.start, b, grip, sweeps=sweeps)
 
 
