@@ -18,6 +18,7 @@ from jiggle_mj.estimator.chamfer import Chamfer
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.filters.shots import simulator
 from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.perception.point_tracker import FEWEST
 from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
 from jiggle_mj.estimator.xpbd import XPBD
 from scipy.spatial import KDTree
@@ -32,8 +33,6 @@ LONGEST_EDGE = 2.5
 """Triangles with a longer edge are no tissue [spacing]."""
 THINNED = 0.75
 """Least distance of two particles, which are then about one apart [spacing]."""
-FEWEST = 20
-"""Fewest particles that make a sheet."""
 AROUND = 0.7
 """Points of the clouds at rest within this distance give a particle its height [spacing]."""
 SAMPLES = 3000
