@@ -1,15 +1,14 @@
 """Carries the truth from the reference's vertices to the estimator's particles, since the two meshes share none.
 
 Attachment goes by the nearest rest vertex: a particle is truly attached iff its nearest reference vertex is. Stiffness
-goes as a density: what is physical is the stiffness per area of tissue, and a vertex of either mesh stands for a third
-of the triangles around it, so
+goes by virtual work: a vertex's spring pulls at a point of one of the estimator's triangles, whose corners share it,
 
-    b*_particle = b*_vertex * area_particle / area_vertex.
+    b*_particle = sum over vertices of (barycentric weight of the particle at the vertex) b*_vertex,
+
+as consistent nodal loads do in finite elements. So total and centre are kept on any mesh; a particle at the border of a
+patch has a part of what one inside has, and its free neighbour may have the rest.
 
 Positions go by barycentric interpolation in the reference's rest triangle nearest to the particle's rest position.
-
-Nothing here smooths: a line of attachments one vertex wide keeps its total stiffness on average over meshes, not on
-each mesh.
 """
 
 from dataclasses import dataclass
@@ -35,7 +34,7 @@ class CarriedTruth:
 
     attached: Bool[np.ndarray, " n"]
     stiffness: Float[np.ndarray, " n"]
-    """b*, rescaled by area [N/m]; inf for a weld, NaN where attached by an unknown amount."""
+    """b* [N/m]; inf for a weld, NaN where attached by an unknown amount."""
     load: Float[np.ndarray, " n"] | None = None
     """Root of the sum over frames of the squared force that the attachment carried [N]; None where not recorded."""
 
@@ -43,13 +42,6 @@ class CarriedTruth:
     def observable(self) -> Bool[np.ndarray, " n"] | None:
         """Attached particles that were loaded enough to show: at least `OBSERVABLE`; None where not recorded."""
         return None if self.load is None else self.attached & (self.load >= OBSERVABLE)
-
-
-def vertex_areas(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " n"]:
-    """A third of the area of the triangles around each vertex [m^2]."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    third = np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 6
-    return np.bincount(faces.ravel(), weights=np.repeat(third, 3), minlength=len(vertices))
 
 
 def frame_at(truth: Truth, index: int) -> TruthFrame | None:
@@ -72,21 +64,30 @@ def stiffness_at(truth: Truth, frame: TruthFrame | None) -> Float[np.ndarray, " 
 def carry(sheet: Sheet, truth: Truth, index: int) -> CarriedTruth:
     """The truth at observation `index` on the particles of `sheet`, and the loads up to it.
 
-    A reference without triangles has no areas: its stiffness and loads are taken over unscaled.
+    Vertices further from the sheet than its edges are long stand for tissue that it does not have.
     """
-    nearest = np.asarray(KDTree(truth.rest).query(sheet.rest)[1])
-    stiffness = stiffness_at(truth, frame_at(truth, index))[nearest]
-    attached = np.isnan(stiffness) | (stiffness > 0)
+    at_vertices = stiffness_at(truth, frame_at(truth, index))
     loads = [frame.load for frame in truth.frames if frame.load is not None and frame.index <= index]
-    load = np.sqrt(np.sum(np.square(loads), axis=0))[nearest] if loads else None
-    if len(truth.faces):
-        mine, reference = vertex_areas(sheet.rest, sheet.faces), vertex_areas(truth.rest, truth.faces)[nearest]
-        scalable = attached & (reference > 0)
-        larger = mine[scalable] / reference[scalable]
-        stiffness[scalable] *= larger
-        if load is not None:
-            load[scalable] *= larger
-    return CarriedTruth(attached=attached, stiffness=stiffness, load=load)
+    corners, weights = barycentric_weights(truth.rest, sheet.rest, sheet.faces)
+    foot = np.einsum("vk,vki->vi", weights, sheet.rest[corners])
+    weights[np.linalg.norm(foot - truth.rest, axis=1) > _edge_length(sheet)] = 0
+
+    def shared(values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
+        return np.bincount(corners.ravel(), (weights * values[:, None]).ravel(), minlength=len(sheet.rest))
+
+    nearest = at_vertices[np.asarray(KDTree(truth.rest).query(sheet.rest)[1])]
+    finite = np.isfinite(nearest)
+    return CarriedTruth(
+        attached=np.isnan(nearest) | (nearest > 0),
+        stiffness=np.where(finite, shared(np.where(np.isfinite(at_vertices), at_vertices, 0.0)), nearest),
+        load=shared(np.sqrt(np.sum(np.square(loads), axis=0))) if loads else None,
+    )
+
+
+def _edge_length(sheet: Sheet) -> float:
+    """The longest edge [m], infinite without triangles."""
+    corners = sheet.rest[sheet.faces]
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(initial=0)) or np.inf
 
 
 def barycentric_weights(
