@@ -94,9 +94,9 @@ class AttachmentBelief(eqx.Module):
         sites = jax.lax.fori_loop(0, MATCHES, narrower, jnp.clip(1 / found.variance, *SITE_PRECISION))
         shift = self.precision @ found.mean + sites * found.mean - self.shift
         belief = eqx.tree_at(
-            lambda belief: (belief.site_precision, belief.site_shift, belief.prior.stiffness.share),
+            lambda belief: (belief.site_precision, belief.site_shift, belief.prior.stiffness.whole),
             self,
-            (sites, shift, found.share),
+            (sites, shift, found.whole),
         )
         _, factor = belief._mixture(*belief._cavity(belief.gaussian()))
         beside = self.prior.neighbours < len(self.shift)

@@ -26,8 +26,8 @@ class Sampled(eqx.Module):
     mean: Float[Array, " n"]
     """Of s."""
     variance: Float[Array, " n"]
-    share: Float[Array, " _rungs"]
-    """Of each rung among attached particles."""
+    whole: Float[Array, " _rungs"]
+    """See `SpikeAndSlab.whole`."""
     agree: Bool[Array, ""]
     """Whether the first half of the sweeps says the same as the second."""
 
@@ -45,15 +45,15 @@ class Sampler(eqx.Module):
         skipped, total = burn_in * ROUND, rounds * ROUND
 
         def sweep(k, carried):
-            state, moments, share, weights, sums = carried
+            state, moments, stiffness, weights, sums = carried
             one, other = jax.random.split(jax.random.fold_in(key, k))
-            state, moments, weight = self._sweep(state, moments, share, one)
-            share, mean = self.prior.stiffness.drawn(state, other), moments.mean
+            state, moments, weight = self._sweep(state, moments, stiffness.share, one)
+            stiffness, mean = stiffness.drawn(state, other), moments.mean
             half = jnp.where(k < skipped + total // 2, 0, 1)
             kept = jnp.where(k < skipped, 0.0, 1.0)
-            added = mean, jnp.diagonal(moments.covariance) + mean**2, share
+            added = mean, jnp.diagonal(moments.covariance) + mean**2, stiffness.whole
             sums = jax.tree.map(lambda sum, one: sum + kept * one, sums, added)
-            return state, moments, share, weights.at[half].add(kept * weight), sums
+            return state, moments, stiffness, weights.at[half].add(kept * weight), sums
 
         def round(k, carried):
             state, *others = carried
@@ -61,17 +61,17 @@ class Sampler(eqx.Module):
             state, _, *others = jax.lax.fori_loop(k * ROUND, (k + 1) * ROUND, sweep, first)
             return state, *others
 
-        share, nothing = self.prior.stiffness.share, jnp.zeros_like(self.shift)
-        halves = jnp.zeros((2, len(self.prior.stiffness.mean), len(state)))
-        first = state, share, halves, (nothing, nothing, jnp.zeros_like(share))
+        stiffness, nothing = self.prior.stiffness, jnp.zeros_like(self.shift)
+        halves = jnp.zeros((2, len(stiffness.mean), len(state)))
+        first = state, stiffness, halves, (nothing, nothing, jnp.zeros_like(stiffness.whole))
         _, _, halves, sums = jax.lax.fori_loop(0, burn_in + rounds, round, first)
-        mean, squared, share = jax.tree.map(lambda sum: sum / jnp.asarray(total, sum.dtype), sums)
+        mean, squared, whole = jax.tree.map(lambda sum: sum / jnp.asarray(total, sum.dtype), sums)
         attached = 1 - halves[:, 0] / jnp.sum(halves, axis=1)
         return Sampled(
             weight=jnp.sum(halves, axis=0) / jnp.sum(halves, axis=(0, 1))[None],
             mean=mean,
             variance=squared - mean**2,
-            share=share,
+            whole=whole,
             agree=jnp.mean(jnp.abs(attached[0] - attached[1])) < AGREE,
         )
 

@@ -3,12 +3,14 @@
 The prior is a spike and a slab [Mitchell & Beauchamp 1988, doi:10.1080/01621459.1988.10478694]: free is a half-normal
 too narrow to matter, attached a mixture of normals from soft to rigid, the rungs of a ladder, all cut off to [0, 1].
 Times a Gaussian each part is a truncated normal, so that odds, moments and quantiles are closed forms. How often each
-rung occurs is learned from the particles that are called attached: attachments of one tissue resemble each other.
+rung occurs is learned from the particles that are called attached: attachments of one tissue resemble each other, but
+an attachment that ends between two particles leaves the one at its border any part of what others have.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.special import log_ndtr, logsumexp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Int, PRNGKeyArray
@@ -67,21 +69,34 @@ class SpikeAndSlab(eqx.Module):
     mean: Float[Array, " c"]
     """Of each normal before it is cut off; 0 for the spike, the first."""
     sd: Float[Array, " c"]
-    share: Float[Array, " _rungs"]
-    """Of each rung among attached particles."""
+    whole: Float[Array, " _rungs"]
+    """Share of each rung among attachments before they are parted."""
+    parting: Float[Array, "_rungs _rungs"]
+    """Share of each rung (row) among particles whose attachment, if they had all of it, were on another (column)."""
     even: Float[Array, ""]
     """How many attached particles the even shares are worth, from which learning starts."""
 
     @classmethod
-    def build(cls, *, spike: float, rungs: tuple[float, ...], spread: float, even: float) -> "SpikeAndSlab":
-        """For a spike of width `spike` and rungs at the given s, each as wide as `spread` times its s."""
+    def build(
+        cls, *, spike: float, rungs: tuple[float, ...], spread: float, even: float, partial: float
+    ) -> "SpikeAndSlab":
+        """For a spike of width `spike` and rungs at the given s, each as wide as `spread` times its s.
+
+        `partial` is the share of attached particles that have a part, as likely any as another, of their attachment.
+        """
         centre = jnp.asarray(rungs, dtype=float)
         return cls(
             mean=jnp.concatenate([jnp.zeros(1), centre]),
             sd=jnp.concatenate([jnp.full(1, spike), spread * centre]),
-            share=jnp.full(len(rungs), 1 / len(rungs)),
+            whole=jnp.full(len(rungs), 1 / len(rungs)),
+            parting=(1 - partial) * jnp.eye(len(rungs)) + partial * jnp.asarray(_parted(np.asarray(rungs))),
             even=jnp.asarray(even, dtype=float),
         )
+
+    @property
+    def share(self) -> Float[Array, " _rungs"]:
+        """Of each rung among attached particles."""
+        return self.parting @ self.whole
 
     def learned(self, mixture: "Mixture", factor: Float[Array, " n"]) -> "SpikeAndSlab":
         """Shares moved towards those expected after counting the particles likelier attached than not.
@@ -92,13 +107,18 @@ class SpikeAndSlab(eqx.Module):
         """
         counted = (mixture.attached > 0.5) & (factor > 0)
         count = jnp.sum(jnp.where(counted, mixture.weight[1:], 0.0), axis=1)
-        share = (self.even / len(count) + count) / (self.even + jnp.sum(count))
-        return eqx.tree_at(lambda prior: prior.share, self, (1 - LEARNED) * self.share + LEARNED * share)
+        count = self.whole * (self.parting.T @ (count / self.share))
+        whole = (self.even / len(count) + count) / (self.even + jnp.sum(count))
+        return eqx.tree_at(lambda prior: prior.whole, self, (1 - LEARNED) * self.whole + LEARNED * whole)
 
-    def drawn(self, state: Int[Array, " n"], key: PRNGKeyArray) -> Float[Array, " _rungs"]:
+    def drawn(self, state: Int[Array, " n"], key: PRNGKeyArray) -> "SpikeAndSlab":
         """Shares drawn from what is known of them given each particle's state: 0 is free, k on the k-th rung."""
-        count = jnp.zeros(len(self.mean)).at[state].add(1.0)[1:]
-        return jax.random.dirichlet(key, self.even / len(count) + count) + RARE
+        by_part, by_share = jax.random.split(key)
+        parted = jnp.log(self.whole)[None] + jnp.log(self.parting[jnp.maximum(state - 1, 0)])
+        of = jnp.where(state > 0, 1 + jax.random.categorical(by_part, parted, axis=1), 0)
+        count = jnp.zeros(len(self.mean)).at[of].add(1.0)[1:]
+        whole = jax.random.dirichlet(by_share, self.even / len(count) + count) + RARE
+        return eqx.tree_at(lambda prior: prior.whole, self, whole)
 
     def posterior(
         self, mean: Float[Array, " n"], variance: Float[Array, " n"], log_odds: Float[Array, " n"]
@@ -121,6 +141,13 @@ class SpikeAndSlab(eqx.Module):
         attached = jax.nn.sigmoid(log_odds + factor)[None]
         weight = jnp.concatenate([1 - attached, attached * jax.nn.softmax(rungs, axis=0)])
         return eqx.tree_at(lambda parts: parts.weight, parts, weight), factor
+
+
+def _parted(rungs: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r r"]:
+    """Probability of being nearest to each rung (row), in the logarithm of b, for any part of the b of another."""
+    b = rungs / np.maximum(1 - rungs, 1e-9)
+    between = np.concatenate([[0], np.sqrt(b[1:] * b[:-1]), [np.inf]])
+    return np.diff(np.minimum(between[:, None] / b[None], 1), axis=0)
 
 
 def _cut_off(mean: Float[Array, "c n"], sd: Float[Array, "c n"]) -> Float[Array, "c n"]:

@@ -33,6 +33,8 @@ class Calibration:
     """The same over the truly attached particles alone: a free one is exactly where a prior may have its peak."""
     coverage_90: float | None
     """Share of particles whose true stiffness lies in the central 90 % interval of its marginal."""
+    coverage_attached: float | None
+    """The same among the truly attached alone: an interval from 0 holds every free one."""
     ece: float | None
     """Expected calibration error of the probabilities of being attached."""
 
@@ -64,13 +66,23 @@ def nees_per_dof(
     return float(error @ cho_solve(factor, error) / known.sum())
 
 
-def coverage(belief: Belief, stiffness: Float[np.ndarray, " n"], level: float = LEVEL) -> float | None:
-    """Share of particles of finite b* and variance with |b_hat - b*| <= z sd, z the two-sided normal quantile."""
-    known = np.isfinite(stiffness) & np.isfinite(np.diagonal(belief.covariance))
+def coverage(
+    belief: Belief,
+    stiffness: Float[np.ndarray, " n"],
+    level: float = LEVEL,
+    *,
+    among: Bool[np.ndarray, " n"] | None = None,
+) -> float | None:
+    """Share of particles of finite b* and variance with |b_hat - b*| <= z sd, z the two-sided normal quantile.
+
+    Of a belief that states intervals of its own, the share with b* inside; with `among` only over those.
+    """
+    stated = belief.lower is not None and belief.upper is not None
+    known = ~np.isnan(stiffness) if stated else np.isfinite(stiffness) & np.isfinite(np.diagonal(belief.covariance))
+    known = known if among is None else known & among
     if not known.any():
         return None
     if belief.lower is not None and belief.upper is not None:
-        known = ~np.isnan(stiffness)
         return float(np.mean((belief.lower <= stiffness)[known] & (stiffness <= belief.upper)[known]))
     half_width = ndtri((1 + level) / 2) * np.sqrt(np.diagonal(belief.covariance)[known])
     return float(np.mean(np.abs(belief.mean[known] - stiffness[known]) <= half_width))
@@ -95,5 +107,6 @@ def calibration(
         nees_per_dof=nees_per_dof(belief, stiffness),
         nees_attached=nees_per_dof(belief, stiffness, among=attached),
         coverage_90=coverage(belief, stiffness),
+        coverage_attached=coverage(belief, stiffness, among=attached),
         ece=None if probability is None else expected_calibration_error(probability, attached),
     )

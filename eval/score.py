@@ -82,7 +82,7 @@ def result(
             "converged": detection.converged,
         },
         "noise": {"force_sd_ratio": detection.force_sd_ratio, "position_sd_ratio": detection.position_sd_ratio},
-        "calibration": {"nees_per_dof": None, "nees_attached": None, "coverage_90": None, "ece": None},
+        "calibration": dict.fromkeys(("nees_per_dof", "nees_attached", "coverage_90", "coverage_attached", "ece")),
         "tracking": {"rms_m": None},
         "safety": {"limit_j": None, "max_mean_boundary_energy_j": None, "violations": None},
         "entropy": {
@@ -136,6 +136,7 @@ def with_truth(
         nees_per_dof=judged.nees_per_dof,
         nees_attached=judged.nees_attached,
         coverage_90=judged.coverage_90,
+        coverage_attached=judged.coverage_attached,
         ece=judged.ece,
     )
     _section(scored, "tracking").update(rms_m=tracking(sheet, estimates, truth).rms)

@@ -43,7 +43,7 @@ FIGURES = (
     ("PCD % one ring", ("detection", "by_dilation", "1", "pcd"), 100.0, 1),
     ("PUG % one ring", ("detection", "by_dilation", "1", "pug"), 100.0, 1),
     ("NEES/dof attached", ("calibration", "nees_attached"), 1.0, 2),
-    ("coverage of 90 %", ("calibration", "coverage_90"), 1.0, 2),
+    ("coverage of 90 %, attached", ("calibration", "coverage_attached"), 1.0, 2),
     ("ECE", ("calibration", "ece"), 1.0, 3),
     ("tracking mm", ("tracking", "rms_m"), 1e3, 2),
     ("update s", ("timing", "update_s", "median"), 1.0, 2),

@@ -9,7 +9,7 @@ KEYS = {
         "observable": {"by_dilation": BY_DILATION},
     },
     "noise": dict.fromkeys(("force_sd_ratio", "position_sd_ratio")),
-    "calibration": dict.fromkeys(("nees_per_dof", "nees_attached", "coverage_90", "ece")),
+    "calibration": dict.fromkeys(("nees_per_dof", "nees_attached", "coverage_90", "coverage_attached", "ece")),
     "tracking": {"rms_m": None},
     "safety": dict.fromkeys(("limit_j", "max_mean_boundary_energy_j", "violations")),
     "entropy": dict.fromkeys(("prior", "final")),

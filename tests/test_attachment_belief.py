@@ -11,7 +11,7 @@ from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 from scipy.special import expit, logit
 
 RUNGS, SPREAD = (0.03, 0.3), 0.5
-STIFFNESS = SpikeAndSlab.build(spike=3e-3, rungs=RUNGS, spread=SPREAD, even=1e12)
+STIFFNESS = SpikeAndSlab.build(spike=3e-3, rungs=RUNGS, spread=SPREAD, even=1e12, partial=0.0)
 """So sure of its shares that nothing is learned."""
 PROBABILITY, REFERENCE = 0.1, 30.0
 

@@ -20,7 +20,7 @@ ROUNDS = 3000
 
 def prior(even: float = 1e12) -> AttachmentPrior:
     """A row of particles; by default so sure of its shares that nothing is learned."""
-    stiffness = SpikeAndSlab.build(spike=3e-3, rungs=(0.03, 0.3), spread=0.3, even=even)
+    stiffness = SpikeAndSlab.build(spike=3e-3, rungs=(0.03, 0.3), spread=0.3, even=even, partial=0.0)
     return AttachmentPrior.build(N, EDGES, stiffness=stiffness, probability=PROBABILITY, coupling=COUPLING)
 
 
@@ -91,8 +91,8 @@ def test_a_sweep_keeps_the_moments_up_to_date():
 def test_shares_are_learned_from_those_that_are_attached():
     """Two stiff ones; with few expected beforehand the stiff rung is the commoner."""
     found = sampled(0.6, even=1.0)
-    assert float(found.share[1]) > 0.7
-    assert float(jnp.sum(found.share)) == pytest.approx(1)
+    assert float(found.whole[1]) > 0.7
+    assert float(jnp.sum(found.whole)) == pytest.approx(1)
 
 
 def test_a_belief_takes_over_what_the_samples_say():

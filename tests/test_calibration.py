@@ -42,6 +42,8 @@ def test_coverage_by_hand():
     """sd 1, so the half width is 1.6449: errors 1.6 and 1.7 are inside and outside."""
     belief = Belief(mean=np.array([1.6, 1.7]), covariance=np.eye(2))
     assert coverage(belief, np.zeros(2)) == 0.5
+    assert coverage(belief, np.zeros(2), among=np.array([True, False])) == 1
+    assert coverage(belief, np.zeros(2), among=np.zeros(2, bool)) is None
 
 
 def test_expected_calibration_error_by_hand():

@@ -188,7 +188,9 @@ def test_loads_add_up_in_squares_until_the_frame():
     """3 mN in one frame and 4 mN in the next are 5 mN, on the same mesh; later frames do not count."""
     rest, faces = lattice(2, 0.01)
     frames = tuple(
-        TruthFrame(index=k, time=k, positions=rest, stiffness=np.ones(4), tip=np.zeros(3), load=np.array([load, 0, 0, 0]))
+        TruthFrame(
+            index=k, time=k, positions=rest, stiffness=np.ones(4), tip=np.zeros(3), load=np.array([load, 0, 0, 0])
+        )
         for k, load in enumerate((3e-3, 4e-3, 1.0))
     )
     truth = Truth(rest=rest, faces=faces, attached=np.ones(4, bool), frames=frames, scene="", details={})

@@ -21,7 +21,7 @@ def test_a_same_engine_run_is_scored_and_not_repeated(tmp_path, monkeypatch):
     assert isinstance(detection, dict) and isinstance(entropy, dict)
     assert first["estimator"] == "adam" and detection["n_attached"] == sheet(SCENE)[1].sum()
     assert f"{RULE * STIFFNESS:g} k" in detection["rule"]
-    assert first["calibration"] == {"nees_per_dof": None, "nees_attached": None, "coverage_90": None, "ece": None}
+    assert isinstance(first["calibration"], dict) and not any(first["calibration"].values())
     assert entropy["final"] is None and detection["average_precision"] > 0
 
 

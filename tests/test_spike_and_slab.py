@@ -1,5 +1,6 @@
 """Free or attached: odds, moments and quantiles against numerical integration."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from scipy.stats import norm
 
 SPIKE, RUNGS, SPREAD = 3e-3, (0.01, 0.1, 1.0), 0.5
 LOG_ODDS = -3.0
-PRIOR = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=3.0)
+PRIOR = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=3.0, partial=0.0)
 
 
 def density(mean: float, variance: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -71,3 +72,34 @@ def test_the_shares_are_those_of_the_particles_called_attached():
     np.testing.assert_allclose(once.share, PRIOR.share + LEARNED * (learned.share - PRIOR.share), rtol=1e-5)
     nobody, factor = PRIOR.posterior(jnp.zeros(4), jnp.full(4, 1e-6), jnp.full(4, LOG_ODDS))
     np.testing.assert_allclose(PRIOR.learned(nobody, factor).share, 1 / 3)
+
+
+def test_a_part_of_an_attachment_is_on_the_nearest_softer_rung():
+    """A million parts, as likely as one another, of the b = s / (1 - s) of each rung."""
+    rungs = np.array([0.01, 0.1, 0.5, 0.95])
+    prior = SpikeAndSlab.build(spike=SPIKE, rungs=tuple(rungs), spread=SPREAD, even=3.0, partial=1.0)
+    parts = np.linspace(0, 1, 1_000_001)[1:]
+    logs = np.log(rungs / (1 - rungs))
+    for column, log in enumerate(logs):
+        nearest = np.argmin(np.abs(np.log(parts)[:, None] + log - logs), axis=1)
+        np.testing.assert_allclose(prior.parting[:, column], np.bincount(nearest, minlength=4) / 1e6, atol=1e-5)
+
+
+def test_the_shares_before_parting_are_learned_through_it():
+    """Particles as whole attachments on the third rung and a half of parts of such leave: what EM settles on, and what
+    draws are spread around."""
+    prior = SpikeAndSlab.build(spike=SPIKE, rungs=(0.01, 0.03, 0.1, 0.3), spread=0.1, even=1.0, partial=0.5)
+    count = np.rint(2000 * np.asarray(prior.parting[:, 2])).astype(int)
+    state = np.append(np.zeros(50, int), np.repeat(np.arange(4), count) + 1)
+    s = jnp.asarray(np.append(0.0, [0.01, 0.03, 0.1, 0.3])[state])
+    mixture, factor = prior.posterior(s, jnp.full(len(s), 1e-9), jnp.full(len(s), LOG_ODDS))
+    learned = prior
+    for _ in range(200):
+        learned = learned.learned(mixture, factor)
+    assert float(learned.whole[2]) > 0.98
+    np.testing.assert_allclose(learned.share, prior.parting[:, 2], atol=0.02)
+    drawn, kept = prior, []
+    for k in range(300):
+        drawn = drawn.drawn(jnp.asarray(state), jax.random.key(k))
+        kept.append(np.asarray(drawn.whole))
+    np.testing.assert_allclose(np.mean(kept[100:], axis=0), learned.whole, atol=0.02)

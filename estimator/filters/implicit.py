@@ -27,6 +27,9 @@ SPIKE = 3e-4
 """Width of s where free."""
 RUNGS, SPREAD, EVEN = tuple(0.003 * 10 ** (i / 4) for i in range(11)), 0.3, 3.0
 """Of s where attached, from hardly felt to rigid; their relative widths; see `SpikeAndSlab.even`."""
+PARTIAL = 0.4
+"""Share of attached particles that have a part of an attachment, as at a border: what two meshes make of the shipped
+scenes."""
 PROBABILITY, COUPLING = 0.047, 1.0
 """Of being attached without attached neighbours, and what each adds to the log odds: three of an inner particle's six
 make it even, so that a free and an attached stretch are equally likely beforehand. A little more of either, and samples
@@ -131,7 +134,7 @@ class ImplicitFilter(Filter):
 
 def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
     """The prior of a sheet, with b_ref = reference [N/m]."""
-    stiffness = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=EVEN)
+    stiffness = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=EVEN, partial=PARTIAL)
     prior = AttachmentPrior.build(mesh.n, mesh.edges, stiffness=stiffness, probability=PROBABILITY, coupling=COUPLING)
     return AttachmentBelief.before(prior, reference=reference)
 
