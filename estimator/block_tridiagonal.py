@@ -4,7 +4,15 @@ Particles in a good order interact only within a band; cutting the order into bl
 block-tridiagonal matrix, whose Cholesky factor costs O(n band^2) instead of O(n^3). `Layout` holds the order,
 `BlockTridiagonal` the numbers. Every particle carries three degrees of freedom. Not a general sparse solver: the band
 must fit.
+
+Blocks are eliminated from both ends towards the middle [the twisted factorisation: van der Vorst 1987, Parallel
+Computing 5:45]. It is as much work, but a GPU, which waits for each block, goes through both halves
+at once, and a right-hand side that is banded itself stays sparse for longer.
 """
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,6 +35,7 @@ class Layout(eqx.Module):
     slot: Int[np.ndarray, " n"] | Int[Array, " n"]
     """Place of each particle in the padded order."""
     n_blocks: int = eqx.field(static=True)
+    """Odd, so that one is in the middle."""
     width: int = eqx.field(static=True)
     """Particles in a block."""
 
@@ -47,7 +56,7 @@ class Layout(eqx.Module):
         ranks = [np.argsort(order) for order in orders]
         bands = [max(1, int(np.abs(rank[rows] - rank[columns]).max(initial=1))) for rank in ranks]
         best, n = int(np.argmin(bands)), len(orders[0])
-        n_blocks = max(1, n // bands[best])
+        n_blocks = (n // bands[best] - 1) // 2 * 2 + 1 if n > bands[best] else 1
         return cls(slot=ranks[best], n_blocks=n_blocks, width=-(-n // n_blocks))
 
     def blocks(self, values: Float[Array, "n ..."]) -> Float[Array, "blocks width ..."]:
@@ -88,15 +97,17 @@ class BlockTridiagonal(eqx.Module):
 
 
 class BlockCholesky(eqx.Module):
-    """The factor L of A = L L^T, block-bidiagonal.
+    """The factor L of A = L L^T, its rows and columns ordered from both ends to the middle.
 
     The diagonal blocks are kept as inverses: products with them run several times faster than triangular solves.
     """
 
-    inverse: Float[Array, "blocks m m"]
-    """Inverse of each diagonal block."""
-    lower: Float[Array, "blocks-1 m m"]
-    """Block (k + 1, k)."""
+    inverse: Float[Array, "2 half m m"]
+    """Inverse of each diagonal block, from either end."""
+    inward: Float[Array, "2 half m m"]
+    """The block that couples each to the next towards the middle."""
+    middle: Float[Array, "m m"]
+    """Inverse of the middle's diagonal block."""
 
 
 def assemble(
@@ -131,17 +142,20 @@ def add_to_diagonal(
 def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
     """Factor A = L L^T block by block; NaN where A is not positive definite."""
 
-    def step(previous, blocks):
-        diagonal, lower = blocks
-        coupling = lower @ previous.T
-        factor = jnp.linalg.cholesky(diagonal - coupling @ coupling.T, symmetrize_input=False)
-        inverse = lower_inverse(factor)
-        return inverse, (inverse, coupling)
+    def inverse_factor(block):
+        return lower_inverse(jnp.linalg.cholesky(block, symmetrize_input=False))
 
-    before_first = jnp.zeros_like(matrix.diagonal[0])
-    lower = jnp.concatenate([before_first[None], matrix.lower])
-    _, (inverse, lower) = jax.lax.scan(step, before_first, (matrix.diagonal, lower))
-    return BlockCholesky(inverse=inverse, lower=lower[1:])
+    def step(taken, blocks):
+        diagonal, next_to_this = blocks
+        inverse = inverse_factor(diagonal - taken)
+        inward = next_to_this @ inverse.T
+        return inward @ inward.T, (inverse, inward)
+
+    ends, middle = _split(matrix.diagonal)
+    half = ends.shape[1]
+    couplings = jnp.stack([matrix.lower[:half], matrix.lower[half:][::-1].swapaxes(1, 2)])
+    taken, (inverse, inward) = _from_both_ends(partial(jax.lax.scan, step, jnp.zeros_like(middle)), (ends, couplings))
+    return BlockCholesky(inverse=inverse, inward=inward, middle=inverse_factor(middle - taken[0] - taken[1]))
 
 
 def lower_inverse(factor: Float[Array, "m m"]) -> Float[Array, "m m"]:
@@ -163,50 +177,56 @@ def multiply(layout: Layout, matrix: BlockTridiagonal, x: Float[Array, "n 3"]) -
     return layout.rows(out.reshape(layout.n_blocks, layout.width, 3))
 
 
-def solve_lower(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float[Array, "blocks m k"]:
-    """L z = rhs."""
-
-    def step(previous, blocks):
-        inverse, lower, right = blocks
-        z = inverse @ (right - lower @ previous)
-        return z, z
-
-    lower = jnp.concatenate([jnp.zeros_like(factor.inverse[:1]), factor.lower])
-    return jax.lax.scan(step, jnp.zeros_like(rhs[0]), (factor.inverse, lower, rhs))[1]
-
-
 def lower_square(factor: BlockCholesky, rhs: Float[Array, "blocks m n"]) -> Float[Array, "n n"]:
-    """(L^-1 rhs)^T (L^-1 rhs) of a right-hand side with n / blocks columns a block, in the layout's order.
+    """B^T A^-1 B of a right-hand side B with n / blocks columns a block, in the layout's order.
 
-    Columns may reach no further than one block from their own, as those of a matrix in this layout do: what lies above
-    stays zero in L^-1 rhs, and is left out of the products.
+    Columns may reach no further than one block from their own, as those of a matrix in this layout do: in L^-1 B those
+    of the other end stay zero up to the middle, and are left out of the products.
     """
-    nb, _, n = rhs.shape
-    square = jnp.zeros((n, n), rhs.dtype)
-    z = jnp.zeros_like(rhs[0, :, :0])
-    for k in range(nb):
-        known, reach = z.shape[1], min(k + 2, nb) * (n // nb)
-        right = rhs[k, :, :reach]
-        if k:
-            right = right.at[:, :known].add(-factor.lower[k - 1] @ z)
-        z = factor.inverse[k] @ right
-        square = square.at[:reach, :reach].add(z.T @ z)
-    return square
+    nb, m, n = rhs.shape
+    half, w = nb // 2, n // nb
+    reached = (half + 1) * w
+
+    def outer(blocks):
+        inverse, inward, right = blocks
+        square, taken = jnp.zeros((reached, reached), rhs.dtype), jnp.zeros((m, 0), rhs.dtype)
+        for k in range(half):
+            known, reach = (k + 1) * w if k else 0, (k + 2) * w
+            z = inverse[k] @ right[k, :, :reach].at[:, :known].add(-taken)
+            taken = inward[k] @ z
+            square = square.at[:reach, :reach].add(z.T @ z)
+        return square, jnp.zeros((m, reached), rhs.dtype).at[:, : taken.shape[1]].add(taken)
+
+    mirrored = rhs.reshape(nb, m, nb, w)[::-1, :, ::-1].reshape(nb, m, n)
+    ends = jnp.stack([rhs[:half, :, :reached], mirrored[:half, :, :reached]])
+    squares, taken = _from_both_ends(outer, (factor.inverse, factor.inward, ends))
+    right = rhs[half].at[:, :reached].add(-taken[0])
+    right = right.at[:, n - reached :].add(-taken[1].reshape(m, half + 1, w)[:, ::-1].reshape(m, reached))
+    z = factor.middle @ right
+    last = squares[1].reshape(half + 1, w, half + 1, w)[::-1, :, ::-1].reshape(reached, reached)
+    square = (z.T @ z).at[:reached, :reached].add(squares[0])
+    return square.at[n - reached :, n - reached :].add(last)
 
 
 def inverse_band(factor: BlockCholesky) -> BlockTridiagonal:
-    """The blocks of A^-1 that lie where A has blocks, from the last to the first [Takahashi et al. 1973]."""
+    """The blocks of A^-1 that lie where A has blocks, from the middle outwards [Takahashi et al. 1973].
+
+    In single precision, in half the time: sums of products that are positive semi-definite lose no digits.
+    """
+    dtype, factor = factor.middle.dtype, jax.tree.map(lambda part: part.astype(jnp.float32), factor)
+    middle = factor.middle.T @ factor.middle
 
     def step(following, blocks):
-        inverse, lower = blocks
-        coupling = lower @ inverse
+        inverse, inward = blocks
+        coupling = inward @ inverse
         beside = -following @ coupling
         diagonal = inverse.T @ inverse - coupling.T @ beside
         return diagonal, (diagonal, beside)
 
-    lower = jnp.concatenate([factor.lower, jnp.zeros_like(factor.inverse[:1])])
-    _, (diagonal, beside) = jax.lax.scan(step, jnp.zeros_like(factor.inverse[0]), (factor.inverse, lower), reverse=True)
-    return BlockTridiagonal(diagonal=diagonal, lower=beside[:-1])
+    outwards = partial(jax.lax.scan, step, middle, reverse=True)
+    _, (ends, beside) = _from_both_ends(outwards, (factor.inverse, factor.inward))
+    lower = jnp.concatenate([beside[0], beside[1, ::-1].swapaxes(1, 2)])
+    return BlockTridiagonal(diagonal=_joined(ends, middle).astype(dtype), lower=lower.astype(dtype))
 
 
 def window_sums(
@@ -221,20 +241,38 @@ def window_sums(
     return jnp.einsum("mjab,mjkbc,mkac->m", rows, twice * windows, rows)
 
 
-def solve_upper(factor: BlockCholesky, rhs: Float[Array, "blocks m k"]) -> Float[Array, "blocks m k"]:
-    """L^T z = rhs."""
-
-    def step(following, blocks):
-        inverse, lower, right = blocks
-        z = inverse.T @ (right - lower.T @ following)
-        return z, z
-
-    lower = jnp.concatenate([factor.lower, jnp.zeros_like(factor.inverse[:1])])
-    return jax.lax.scan(step, jnp.zeros_like(rhs[0]), (factor.inverse, lower, rhs), reverse=True)[1]
-
-
 def solve(layout: Layout, factor: BlockCholesky, rhs: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """A z = rhs for one right-hand side given per particle."""
-    blocks = layout.blocks(rhs).reshape(layout.n_blocks, 3 * layout.width, 1)
-    z = solve_upper(factor, solve_lower(factor, blocks))
-    return layout.rows(z.reshape(layout.n_blocks, layout.width, 3))
+
+    def forward(taken, blocks):
+        inverse, inward, right = blocks
+        z = inverse @ (right - taken)
+        return inward @ z, z
+
+    def backward(following, blocks):
+        inverse, inward, z = blocks
+        x = inverse.T @ (z - inward.T @ following)
+        return x, x
+
+    ends, middle = _split(layout.blocks(rhs).reshape(layout.n_blocks, -1))
+    start = partial(jax.lax.scan, forward, jnp.zeros_like(middle))
+    taken, z = _from_both_ends(start, (factor.inverse, factor.inward, ends))
+    middle = factor.middle.T @ (factor.middle @ (middle - taken[0] - taken[1]))
+    _, x = _from_both_ends(partial(jax.lax.scan, backward, middle, reverse=True), (factor.inverse, factor.inward, z))
+    return layout.rows(_joined(x, middle).reshape(layout.n_blocks, layout.width, 3))
+
+
+def _from_both_ends(run: Callable[[Any], Any], blocks: Any) -> Any:
+    """`run` for either end's blocks, the first axis: one after the other on a CPU, whose cores share each product."""
+    return jax.lax.platform_dependent(blocks, cpu=partial(jax.lax.map, run), default=jax.vmap(run))
+
+
+def _split(blocks: Float[Array, "blocks ..."]) -> tuple[Float[Array, "2 half ..."], Float[Array, "..."]]:
+    """The blocks from either end towards the middle, and the middle."""
+    half = len(blocks) // 2
+    return jnp.stack([blocks[:half], blocks[half + 1 :][::-1]]), blocks[half]
+
+
+def _joined(ends: Float[Array, "2 half ..."], middle: Float[Array, "..."]) -> Float[Array, "blocks ..."]:
+    """The inverse of `_split`."""
+    return jnp.concatenate([ends[0], middle[None], ends[1, ::-1]])

@@ -102,8 +102,8 @@ def test_the_truths_figures_by_hand():
     """Reported {0, 5}, attached {0, 1}: PCD = PUG = 1/2; scores rank 0, 1 first, so AP = 1; RMS 0.3 mm.
 
     Same mesh, so b* is unscaled: errors 0.1, -0.2, 0, 0, 0, 0.2 with variance 0.01, NEES/dof = 0.09/0.01/6 = 1.5, of
-    the attached 0.05/0.01/2 = 2.5, and four of six lie within 1.645 sd = 0.164, one of the two attached. At one ring 5 is
-    still no neighbour of 0 or 1 and 0 reaches 1.
+    the attached 0.05/0.01/2 = 2.5, and four of six lie within 1.645 sd = 0.164, one of the two attached. At one ring 5
+    is still no neighbour of 0 or 1 and 0 reaches 1.
     """
     figures = scored()
     assert figures["detection"]["by_dilation"]["0"] == {"pcd": 0.5, "pug": 0.5, "f1": 0.5}

@@ -36,6 +36,9 @@ from jiggle_mj.estimator.filters.noise import Misfit
 from jiggle_mj.estimator.filters.tethered import Tethered
 from jiggle_mj.estimator.mesh import SheetMesh, neighbour_table, pattern
 
+ROUGH = 3.0
+"""Unbalanced force at which a state is smooth enough to be linearised at, in standard deviations of the force error."""
+
 
 class ForceBalance(eqx.Module):
     """The balance of forces of one sheet, to be linearised at any state."""
@@ -104,16 +107,21 @@ class ForceBalance(eqx.Module):
         """That of the same sheet with other parameters."""
         return eqx.tree_at(lambda one: (one.energy, one.tethered), self, (energy, Tethered.build(energy)))
 
-    def settle(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
-        """Equilibrium at fixed s of the sheet tethered to the observed positions, searched from x."""
-        b, stiff = self.reference * s / (1 - s), self.grip_stiffness
-        sd = self.force_sd
-        return self.tethered.settle(b, evidence, x, force_sd=sd, force_tolerance=sd, grip_stiffness=stiff).x
+    def settle(
+        self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence, *, unbalanced: float = ROUGH
+    ) -> Float[Array, "n 3"]:
+        """Equilibrium at fixed s of the sheet tethered to the observed positions, searched from x.
+
+        The search ends where no particle feels more than `unbalanced` standard deviations of the force error.
+        """
+        b, sd = self.reference * s / (1 - s), self.force_sd
+        tolerance, stiff = unbalanced * sd, self.grip_stiffness
+        return self.tethered.settle(b, evidence, x, force_sd=sd, force_tolerance=tolerance, grip_stiffness=stiff).x
 
     def predict(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
         """Equilibrium at fixed s of the sheet that only the grip pulls at, searched from x."""
         held = jnp.where(evidence.held[:, None, None], evidence.precision, 0.0)
-        return self.settle(x, s, eqx.tree_at(lambda one: one.precision, evidence, held))
+        return self.settle(x, s, eqx.tree_at(lambda one: one.precision, evidence, held), unbalanced=1.0)
 
     def approach(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> "Frame":
         """Linearise where a Gauss-Newton step on the state alone, at fixed s, gains no more than `SETTLED`."""

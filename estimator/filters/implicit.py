@@ -34,8 +34,6 @@ PROBABILITY, COUPLING = 0.047, 1.0
 """Of being attached without attached neighbours, and what each adds to the log odds: three of an inner particle's six
 make it even, so that a free and an attached stretch are equally likely beforehand. A little more of either, and samples
 find everything attached where little is known, or nothing."""
-SWEEPS = 2
-"""Of expectation propagation after a frame."""
 BURN_IN, PASSING, SAMPLES = 3, 6, 40
 """Rounds of samples when the jaws open: left out, kept while grasps are linearised again, and kept at the end."""
 STALE = 0.1
@@ -183,7 +181,7 @@ def _update(
     belief = belief.add(found.precision, found.shift)
     gaussian = belief.gaussian()
     nis = _normalised_innovation(found, gaussian.factor, evidence)
-    belief = belief.sweep(gaussian).refine(SWEEPS - 1)
+    belief = belief.sweep(gaussian)
     stated = _stated(belief, frame.converged)
     x = balance.polish(frame, belief.bounded(stated.b), evidence)
     return Update(**vars(stated), x=x, nis=nis), found
