@@ -71,9 +71,14 @@ class AttachmentBelief(eqx.Module):
         return jax.lax.fori_loop(0, sweeps, lambda _, belief: belief.sweep(belief.gaussian()), self)
 
     def sampled(
-        self, key: PRNGKeyArray, *, burn_in: int, rounds: int | Int[Array, ""]
+        self,
+        key: PRNGKeyArray,
+        *,
+        burn_in: int,
+        rounds: int | Int[Array, ""],
+        doublings: int | Int[Array, ""] = 1,
     ) -> tuple["AttachmentBelief", Bool[Array, ""]]:
-        """The belief that samples of the posterior give, and whether both halves of them agree (`attachment_sampler`).
+        """The belief that samples of the posterior give, and whether both halves of them agree (see `Sampler.run`).
 
         The chain begins at what is believed. The sites are those that give s the samples' mean and, as nearly as sites
         can, variance; the messages those that give the samples' P(attached).
@@ -81,7 +86,7 @@ class AttachmentBelief(eqx.Module):
         mixture, _ = self._mixture(*self._cavity(self.gaussian()))
         state = jnp.where(mixture.attached > 0.5, 1 + jnp.argmax(mixture.weight[1:], axis=0), 0)
         sampler = Sampler(prior=self.prior, precision=self.precision, shift=self.shift)
-        found = sampler.run(state, key, burn_in=burn_in, rounds=rounds)
+        found = sampler.run(state, key, burn_in=burn_in, rounds=rounds, doublings=doublings)
         return self._saying(found), found.agree
 
     def _saying(self, found: Sampled) -> "AttachmentBelief":

@@ -29,7 +29,7 @@ class Sampled(eqx.Module):
     whole: Float[Array, " _rungs"]
     """See `SpikeAndSlab.whole`."""
     agree: Bool[Array, ""]
-    """Whether the first half of the sweeps says the same as the second."""
+    """Whether the first half of the sweeps says the same of P(attached) as the second."""
 
 
 class Sampler(eqx.Module):
@@ -40,20 +40,30 @@ class Sampler(eqx.Module):
     """Of the evidence about s."""
     shift: Float[Array, " n"]
 
-    def run(self, state: Int[Array, " n"], key: PRNGKeyArray, *, burn_in: int, rounds: int | Int[Array, ""]) -> Sampled:
-        """Average `rounds` rounds of `ROUND` sweeps after leaving out the first `burn_in` from a state."""
-        skipped, total = burn_in * ROUND, rounds * ROUND
+    def run(
+        self,
+        state: Int[Array, " n"],
+        key: PRNGKeyArray,
+        *,
+        burn_in: int,
+        rounds: int | Int[Array, ""],
+        doublings: int | Int[Array, ""] = 1,
+    ) -> Sampled:
+        """Average rounds of `ROUND` sweeps from a state, leaving out the first `burn_in`.
+
+        After `rounds` of them come as many again; and then as many as all so far again, until both halves agree, with
+        `doublings` at most.
+        """
+        rounds = jnp.asarray(rounds)
 
         def sweep(k, carried):
-            state, moments, stiffness, weights, sums = carried
+            state, moments, stiffness, sums = carried
             one, other = jax.random.split(jax.random.fold_in(key, k))
             state, moments, weight = self._sweep(state, moments, stiffness.share, one)
             stiffness, mean = stiffness.drawn(state, other), moments.mean
-            half = jnp.where(k < skipped + total // 2, 0, 1)
-            kept = jnp.where(k < skipped, 0.0, 1.0)
-            added = mean, jnp.diagonal(moments.covariance) + mean**2, stiffness.whole
-            sums = jax.tree.map(lambda sum, one: sum + kept * one, sums, added)
-            return state, moments, stiffness, weights.at[half].add(kept * weight), sums
+            squared = jnp.diagonal(moments.covariance) + mean**2
+            sums = jax.tree.map(jnp.add, sums, Sums(weight=weight, mean=mean, squared=squared, whole=stiffness.whole))
+            return state, moments, stiffness, sums
 
         def round(k, carried):
             state, *others = carried
@@ -61,18 +71,30 @@ class Sampler(eqx.Module):
             state, _, *others = jax.lax.fori_loop(k * ROUND, (k + 1) * ROUND, sweep, first)
             return state, *others
 
-        stiffness, nothing = self.prior.stiffness, jnp.zeros_like(self.shift)
-        halves = jnp.zeros((2, len(stiffness.mean), len(state)))
-        first = state, stiffness, halves, (nothing, nothing, jnp.zeros_like(stiffness.whole))
-        _, _, halves, sums = jax.lax.fori_loop(0, burn_in + rounds, round, first)
-        mean, squared, whole = jax.tree.map(lambda sum: sum / jnp.asarray(total, sum.dtype), sums)
-        attached = 1 - halves[:, 0] / jnp.sum(halves, axis=1)
+        def again(carried):
+            state, stiffness, sums, done, part, _ = carried
+            count = jnp.where(part == 0, burn_in, rounds * 2 ** jnp.maximum(part - 2, 0))
+            state, stiffness, new = jax.lax.fori_loop(done, done + count, round, (state, stiffness, nothing))
+            apart = jnp.mean(jnp.abs(sums.attached - new.attached))
+            sums = jax.tree.map(lambda sum, one: jnp.where(part == 0, 0.0, sum + one), sums, new)
+            return state, stiffness, sums, done + count, part + 1, (part > 1) & (apart < AGREE)
+
+        def unsettled(carried):
+            part, agree = carried[4:]
+            return (part < 2 + doublings) & ~agree
+
+        stiffness = self.prior.stiffness
+        nothing = Sums.none(len(stiffness.mean), len(state))
+        first = state, stiffness, nothing, jnp.asarray(0), jnp.asarray(0), jnp.asarray(False)
+        _, _, sums, _, _, agree = jax.lax.while_loop(unsettled, again, first)
+        sweeps = jnp.sum(sums.weight[:, 0])
+        mean = sums.mean / sweeps
         return Sampled(
-            weight=jnp.sum(halves, axis=0) / jnp.sum(halves, axis=(0, 1))[None],
+            weight=sums.weight / jnp.sum(sums.weight, axis=0)[None],
             mean=mean,
-            variance=squared - mean**2,
-            whole=whole,
-            agree=jnp.mean(jnp.abs(attached[0] - attached[1])) < AGREE,
+            variance=sums.squared / sweeps - mean**2,
+            whole=sums.whole / sweeps,
+            agree=agree,
         )
 
     def _moments(self, state: Int[Array, " n"]) -> "Moments":
@@ -127,6 +149,25 @@ class Sampler(eqx.Module):
 
         first = state, moments, jnp.zeros((len(width), n)), jnp.asarray(0)
         return jax.lax.while_loop(lambda carried: carried[-1] < n, batch, first)[:3]
+
+
+class Sums(eqx.Module):
+    """Over sweeps, of what `Sampled` averages."""
+
+    weight: Float[Array, "c n"]
+    mean: Float[Array, " n"]
+    squared: Float[Array, " n"]
+    whole: Float[Array, " _rungs"]
+
+    @classmethod
+    def none(cls, c: int, n: int) -> "Sums":
+        """Over no sweep, of n particles in c states."""
+        return cls(weight=jnp.zeros((c, n)), mean=jnp.zeros(n), squared=jnp.zeros(n), whole=jnp.zeros(c - 1))
+
+    @property
+    def attached(self) -> Float[Array, " n"]:
+        """Share of the sweeps in which each particle is attached, 1 over none."""
+        return 1 - self.weight[0] / jnp.maximum(jnp.sum(self.weight, axis=0), 1)
 
 
 class Moments(eqx.Module):

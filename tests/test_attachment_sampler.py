@@ -36,9 +36,13 @@ def sampler(load: float, even: float = 1e12) -> Sampler:
     return Sampler(prior=prior(even), precision=jnp.asarray(precision), shift=jnp.asarray(shift))
 
 
-def sampled(load: float, rounds: int = ROUNDS, even: float = 1e12) -> Sampled:
+def sampled(load: float, rounds: int = ROUNDS, doublings: int = 1, even: float = 1e12) -> Sampled:
     return eqx.filter_jit(sampler(load, even).run)(
-        jnp.zeros(N, int), jax.random.key(1), burn_in=2, rounds=jnp.asarray(rounds)
+        jnp.zeros(N, int),
+        jax.random.key(1),
+        burn_in=2,
+        rounds=jnp.asarray(rounds),
+        doublings=jnp.asarray(doublings),
     )
 
 
@@ -72,8 +76,9 @@ def test_samples_are_those_of_the_posterior(load):
     assert found.agree
 
 
-def test_a_chain_that_has_not_seen_enough_says_so():
+def test_a_chain_that_has_not_seen_enough_says_so_or_goes_on():
     assert not sampled(0.03, rounds=1).agree
+    assert sampled(0.03, rounds=1, doublings=12).agree
 
 
 def test_a_sweep_keeps_the_moments_up_to_date():

@@ -34,8 +34,9 @@ PROBABILITY, COUPLING = 0.047, 1.0
 """Of being attached without attached neighbours, and what each adds to the log odds: three of an inner particle's six
 make it even, so that a free and an attached stretch are equally likely beforehand. A little more of either, and samples
 find everything attached where little is known, or nothing."""
-BURN_IN, PASSING, SAMPLES = 3, 6, 40
-"""Rounds of samples when the jaws open: left out, kept while grasps are linearised again, and kept at the end."""
+BURN_IN, PASSING, SAMPLES = 3, (3, 1), (20, 3)
+"""Rounds of samples when the jaws open: left out, and see `Sampler.run`, how many and how often as many again as all so
+far at most, while grasps are linearised again and at the end."""
 STALE = 0.1
 """A grasp is linearised again when some s has moved further than this from where it was."""
 FELT = 3e-3
@@ -196,13 +197,13 @@ def _information(
     return frame.x, balance.information(frame, fit), balance.misfit(frame, fit, evidence)
 
 
-def _sampled(belief: Any, rounds: int) -> Stated:
-    return _state_sampled(belief, jnp.asarray(rounds))
+def _sampled(belief: Any, rounds: tuple[int, int]) -> Stated:
+    return _state_sampled(belief, *map(jnp.asarray, rounds))
 
 
 @eqx.filter_jit
-def _state_sampled(belief: AttachmentBelief, rounds: Int[Array, ""]) -> Stated:
-    return _stated(*belief.sampled(jax.random.key(0), burn_in=BURN_IN, rounds=rounds))
+def _state_sampled(belief: AttachmentBelief, rounds: Int[Array, ""], doublings: Int[Array, ""]) -> Stated:
+    return _stated(*belief.sampled(jax.random.key(0), burn_in=BURN_IN, rounds=rounds, doublings=doublings))
 
 
 def _stated(belief: AttachmentBelief, converged: Bool[Array, ""]) -> Stated:
