@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jiggle_mj.estimator.filters import force_balance
+from jiggle_mj.estimator.filters.build import FORCE_LEVEL
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.filters.force_balance import DOUBT, FAINT, ForceBalance
 from small_sheet import DECLARATION, attached, dense, lifts, sheet, sheet_balance, sheet_energy
@@ -29,7 +30,8 @@ def balance() -> ForceBalance:
 def test_information_equals_the_dense_formula(balance):
     """D^T N^-1 D, -D^T N^-1 e and e^T N^-1 e over particles that are not held, with N = V + H R H^T written out.
 
-    D is shrunk by a multiple of the share that the covariance of x given all that was seen makes up.
+    tau grows with the sum of what the elements around a particle pull at it. D is shrunk by a multiple of the share
+    that the covariance of x given all that was seen makes up.
     """
     frame = lifts()[3]
     seen, x = evidence(frame, 1), frame.x
@@ -47,7 +49,13 @@ def test_information_equals_the_dense_formula(balance):
     for i in range(N):
         R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = np.linalg.inv(np.asarray(seen.precision)[i] + FAINT * np.eye(3))
         D[3 * i : 3 * i + 3, i] = K * d[i] - internal[i]
-    V = np.diag(((1 - each) * FORCE_SD) ** 2 + (each * K * ANCHOR_SD) ** 2)
+    flow = np.zeros(N)
+    for term in sheet_energy().terms:
+        for vertices, forces in zip(term.vertices, term.gradient(jnp.asarray(x)[term.vertices]), strict=True):
+            flow[np.asarray(vertices)] += np.linalg.norm(forces, axis=1)
+    tau = FORCE_SD * np.sqrt(1 + (flow / (FORCE_LEVEL * K * sheet().spacing)) ** 2)
+    assert tau.max() > 1.3 * tau.min()
+    V = np.diag(((1 - each) * np.repeat(tau, 3)) ** 2 + (each * K * ANCHOR_SD) ** 2)
     W = np.where(free, 1 / np.diagonal(V), 0)
     covariance = np.linalg.inv(np.linalg.inv(R) + H.T @ (W[:, None] * H))
     turn = K * np.eye(3 * N) - stiff

@@ -15,6 +15,10 @@ from jiggle_mj.estimator.surrogate import surrogate
 
 from jiggle_mj.observation import Declaration
 
+FORCE_LEVEL = 0.07
+"""Forces meeting at a particle, summed, from which on the model's error grows with them [k x spacing]: to 0.064 of them
+with the default `EstimatorConfig.force_sd`."""
+
 
 def build_filter(
     mesh: SheetMesh, declaration: Declaration, config: EstimatorConfig
@@ -29,6 +33,7 @@ def build_filter(
             surrogate(mesh, declaration, membrane=config.membrane),
             reference=reference,
             force_sd=force_sd,
+            force_level=FORCE_LEVEL * k * mesh.spacing,
             anchor_sd=config.anchor_sd,
             grip_stiffness=grip_stiffness,
         )
