@@ -6,8 +6,8 @@ block-tridiagonal matrix, whose Cholesky factor costs O(n band^2) instead of O(n
 must fit.
 
 Blocks are eliminated from both ends towards the middle [the twisted factorisation: van der Vorst 1987, Parallel
-Computing 5:45]. It is as much work, but a GPU, which waits for each block, goes through both halves
-at once, and a right-hand side that is banded itself stays sparse for longer.
+Computing 5:45]. It is as much work, but a GPU, which waits for each block, goes through both halves at once, and a
+right-hand side that is banded itself stays sparse for longer.
 """
 
 from collections.abc import Callable

@@ -11,7 +11,6 @@ from jiggle_mj.estimator.block_tridiagonal import BlockTridiagonal, Layout
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
-from jiggle_mj.estimator.filters.build import FORCE_LEVEL
 from jiggle_mj.estimator.filters.evidence import Evidence, Stated, Update
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
@@ -86,15 +85,15 @@ def sheet_energy() -> SheetEnergy:
 
 
 @cache
-def sheet_balance(force_sd: float) -> ForceBalance:
-    """What the implicit filter linearises; force_sd [N]."""
+def sheet_balance(force_sd: float, force_level: float = np.inf) -> ForceBalance:
+    """What the implicit filter linearises; both [N]. Of data of its own model on its own mesh no share is wrong."""
     k = DECLARATION.membrane_stiffness
     return ForceBalance.build(
         sheet(),
         sheet_energy(),
         reference=k,
         force_sd=force_sd,
-        force_level=FORCE_LEVEL * k * sheet().spacing,
+        force_level=force_level,
         anchor_sd=1e-4,
         grip_stiffness=3 * k,
     )

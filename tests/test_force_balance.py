@@ -5,14 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jiggle_mj.estimator.filters import force_balance
-from jiggle_mj.estimator.filters.build import FORCE_LEVEL
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.filters.force_balance import DOUBT, FAINT, ForceBalance
 from small_sheet import DECLARATION, attached, dense, lifts, sheet, sheet_balance, sheet_energy
 from small_sheet import observed as evidence
 
 K = DECLARATION.membrane_stiffness
-FORCE_SD, ANCHOR_SD = 1e-4, 1e-4
+FORCE_SD, FORCE_LEVEL, ANCHOR_SD = 1e-4, 6e-3, 1e-4
 N = sheet().n
 
 
@@ -24,7 +23,7 @@ def information(balance: ForceBalance, x, s, evidence: Evidence):
 
 @pytest.fixture
 def balance() -> ForceBalance:
-    return sheet_balance(FORCE_SD)
+    return sheet_balance(FORCE_SD, FORCE_LEVEL)
 
 
 def test_information_equals_the_dense_formula(balance):
@@ -53,7 +52,7 @@ def test_information_equals_the_dense_formula(balance):
     for term in sheet_energy().terms:
         for vertices, forces in zip(term.vertices, term.gradient(jnp.asarray(x)[term.vertices]), strict=True):
             flow[np.asarray(vertices)] += np.linalg.norm(forces, axis=1)
-    tau = FORCE_SD * np.sqrt(1 + (flow / (FORCE_LEVEL * K * sheet().spacing)) ** 2)
+    tau = FORCE_SD * np.sqrt(1 + (flow / FORCE_LEVEL) ** 2)
     assert tau.max() > 1.3 * tau.min()
     V = np.diag(((1 - each) * np.repeat(tau, 3)) ** 2 + (each * K * ANCHOR_SD) ** 2)
     W = np.where(free, 1 / np.diagonal(V), 0)
