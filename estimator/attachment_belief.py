@@ -61,14 +61,10 @@ class AttachmentBelief(eqx.Module):
         return jnp.where(s < 1, self.reference * s / jnp.where(s < 1, 1 - s, 1), jnp.inf)
 
     def add(self, precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> "AttachmentBelief":
-        """After independent evidence in information form; call `refine` before asking."""
+        """After independent evidence in information form; call `sweep` before asking."""
         return eqx.tree_at(
             lambda belief: (belief.precision, belief.shift), self, (self.precision + precision, self.shift + shift)
         )
-
-    def refine(self, sweeps: int) -> "AttachmentBelief":
-        """Sweeps of expectation and belief propagation over all particles at once, damped."""
-        return jax.lax.fori_loop(0, sweeps, lambda _, belief: belief.sweep(belief.gaussian()), self)
 
     def sampled(
         self,
@@ -111,11 +107,11 @@ class AttachmentBelief(eqx.Module):
         return eqx.tree_at(lambda belief: belief.message, belief, jnp.where(beside, each[:, None], 0.0))
 
     def sweep(self, gaussian: "Gaussian") -> "AttachmentBelief":
-        """One of them, given what `gaussian` returned."""
+        """One sweep of expectation and belief propagation over all particles at once, damped, given its `gaussian`."""
         return self._matched(*self._cavity(gaussian))
 
     def posterior(self) -> "Posterior":
-        """What is believed of each particle; call `refine` before."""
+        """What is believed of each particle; call `sweep` before."""
         gaussian = self.gaussian()
         mixture, _ = self._mixture(*self._cavity(gaussian))
         mean, sd = jnp.clip(gaussian.mean, 0, RIGID), jnp.sqrt(gaussian.variance)

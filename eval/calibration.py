@@ -77,15 +77,14 @@ def coverage(
 
     Of a belief that states intervals of its own, the share with b* inside; with `among` only over those.
     """
-    stated = belief.lower is not None and belief.upper is not None
-    known = ~np.isnan(stiffness) if stated else np.isfinite(stiffness) & np.isfinite(np.diagonal(belief.covariance))
-    known = known if among is None else known & among
-    if not known.any():
-        return None
     if belief.lower is not None and belief.upper is not None:
-        return float(np.mean((belief.lower <= stiffness)[known] & (stiffness <= belief.upper)[known]))
-    half_width = ndtri((1 + level) / 2) * np.sqrt(np.diagonal(belief.covariance)[known])
-    return float(np.mean(np.abs(belief.mean[known] - stiffness[known]) <= half_width))
+        known, held = ~np.isnan(stiffness), (belief.lower <= stiffness) & (stiffness <= belief.upper)
+    else:
+        variance = np.diagonal(belief.covariance)
+        known = np.isfinite(stiffness) & np.isfinite(variance)
+        held = np.abs(belief.mean - stiffness) <= ndtri((1 + level) / 2) * np.sqrt(variance)
+    known = known if among is None else known & among
+    return float(np.mean(held[known])) if known.any() else None
 
 
 def expected_calibration_error(probability: Float[np.ndarray, " n"], attached: Bool[np.ndarray, " n"]) -> float:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from jiggle_mj.eval.metrics import edges
 from scipy.spatial import KDTree
 from trimesh.triangles import closest_point, points_to_barycentric
 
@@ -70,7 +71,7 @@ def carry(sheet: Sheet, truth: Truth, index: int) -> CarriedTruth:
     loads = [frame.load for frame in truth.frames if frame.load is not None and frame.index <= index]
     corners, weights = barycentric_weights(truth.rest, sheet.rest, sheet.faces)
     foot = np.einsum("vk,vki->vi", weights, sheet.rest[corners])
-    weights[np.linalg.norm(foot - truth.rest, axis=1) > _edge_length(sheet)] = 0
+    weights[np.linalg.norm(foot - truth.rest, axis=1) > _longest_edge(sheet)] = 0
 
     def shared(values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
         return np.bincount(corners.ravel(), (weights * values[:, None]).ravel(), minlength=len(sheet.rest))
@@ -84,10 +85,10 @@ def carry(sheet: Sheet, truth: Truth, index: int) -> CarriedTruth:
     )
 
 
-def _edge_length(sheet: Sheet) -> float:
-    """The longest edge [m], infinite without triangles."""
-    corners = sheet.rest[sheet.faces]
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(initial=0)) or np.inf
+def _longest_edge(sheet: Sheet) -> float:
+    """[m], infinite without triangles."""
+    first, second = sheet.rest[edges(sheet.faces)].swapaxes(0, 1)
+    return float(np.linalg.norm(first - second, axis=1).max(initial=0)) or np.inf
 
 
 def barycentric_weights(

@@ -9,11 +9,12 @@ Not judged yet, and null: the limit on the boundary energy and its violations, a
 import copy
 import json
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
-from jiggle_mj.eval.calibration import calibration
+from jiggle_mj.eval.calibration import Calibration, calibration
 from jiggle_mj.eval.carrying import CarriedTruth, carry
 from jiggle_mj.eval.metrics import DILATIONS, agreement, average_precision
 from jiggle_mj.eval.tracking import mean_boundary_energy, tracking
@@ -82,7 +83,7 @@ def result(
             "converged": detection.converged,
         },
         "noise": {"force_sd_ratio": detection.force_sd_ratio, "position_sd_ratio": detection.position_sd_ratio},
-        "calibration": dict.fromkeys(("nees_per_dof", "nees_attached", "coverage_90", "coverage_attached", "ece")),
+        "calibration": dict.fromkeys(field.name for field in fields(Calibration)),
         "tracking": {"rms_m": None},
         "safety": {"limit_j": None, "max_mean_boundary_energy_j": None, "violations": None},
         "entropy": {
@@ -132,13 +133,7 @@ def with_truth(
             n_observable=int(observable.sum()),
             observable={"by_dilation": _agreements(sheet, detection, carried, knowable=observable)},
         )
-    _section(scored, "calibration").update(
-        nees_per_dof=judged.nees_per_dof,
-        nees_attached=judged.nees_attached,
-        coverage_90=judged.coverage_90,
-        coverage_attached=judged.coverage_attached,
-        ece=judged.ece,
-    )
+    _section(scored, "calibration").update(vars(judged))
     _section(scored, "tracking").update(rms_m=tracking(sheet, estimates, truth).rms)
     _section(scored, "safety").update(max_mean_boundary_energy_j=mean_boundary_energy(truth))
     return scored

@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -23,6 +24,10 @@ def chain(n: int, *, coupling: float) -> AttachmentBelief:
     return AttachmentBelief.before(prior, reference=REFERENCE)
 
 
+def refined(belief: AttachmentBelief, sweeps: int) -> AttachmentBelief:
+    return jax.lax.fori_loop(0, sweeps, lambda _, one: one.sweep(one.gaussian()), belief)
+
+
 def alone(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Moments of particles without neighbours, measured independently."""
     odds = jnp.full(len(mean), logit(PROBABILITY))
@@ -32,7 +37,7 @@ def alone(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def test_independent_measurements_give_each_particle_its_own_posterior():
     mean, variance = np.array([0.0, 0.02, 0.15, 0.9]), np.array([1e-5, 1e-4, 1e-4, 1e-2])
-    belief = chain(4, coupling=0.0).add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)).refine(30)
+    belief = refined(chain(4, coupling=0.0).add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)), 30)
     expected, spread = alone(mean, variance)
     posterior = belief.posterior()
     np.testing.assert_allclose(posterior.mean, expected, rtol=1e-6)
@@ -44,7 +49,7 @@ def test_odds_along_a_chain_are_exact():
     n, coupling = 5, 1.5
     mean, variance = np.array([0.0, 0.01, 0.012, 0.0, 0.05]), np.full(5, 3e-5)
     belief = chain(n, coupling=coupling)
-    belief = belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)).refine(60)
+    belief = refined(belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)), 60)
     log_odds = jnp.full(n, logit(PROBABILITY))
     factor = np.asarray(STIFFNESS.posterior(jnp.asarray(mean), jnp.asarray(variance), log_odds)[1])
     total, attached = 0.0, np.zeros(n)
@@ -61,7 +66,7 @@ def test_two_particles_that_share_a_load():
     cannot have two peaks; the spread that it states instead is not too small."""
     total, variance, faint = 0.2, 1e-4, 1e-3
     precision = np.full((2, 2), 1 / variance) + faint * np.eye(2)
-    belief = chain(2, coupling=0.0).add(jnp.asarray(precision), jnp.asarray(np.full(2, total / variance))).refine(60)
+    belief = refined(chain(2, coupling=0.0).add(jnp.asarray(precision), jnp.asarray(np.full(2, total / variance))), 60)
     s = np.concatenate([np.linspace(0, 0.02, 400, endpoint=False), np.linspace(0.02, 1, 2400)])
     parts = [np.exp(-0.5 * ((s - at) / sd) ** 2) for at, sd in ((0, 3e-3), *((rung, SPREAD * rung) for rung in RUNGS))]
     free, soft, stiff = (part / np.trapezoid(part, s) for part in parts)
@@ -78,7 +83,7 @@ def test_two_particles_that_share_a_load():
 
 def test_what_nothing_was_seen_of_stays_at_the_prior():
     belief = chain(3, coupling=0.0)
-    seen = belief.add(jnp.diag(jnp.array([1e6, 0.0, 0.0])), jnp.array([1e5, 0.0, 0.0])).refine(30)
+    seen = refined(belief.add(jnp.diag(jnp.array([1e6, 0.0, 0.0])), jnp.array([1e5, 0.0, 0.0])), 30)
     assert float(seen.posterior().attached[0]) > 0.99
     np.testing.assert_allclose(seen.posterior().attached[1:], PROBABILITY, rtol=1e-6)
     assert float(belief.entropy()) > float(seen.entropy())
@@ -87,13 +92,13 @@ def test_what_nothing_was_seen_of_stays_at_the_prior():
 def test_an_attached_neighbour_raises_the_odds():
     """One that is certain multiplies them by e^J."""
     coupling = 1.2
-    belief = chain(2, coupling=coupling).add(jnp.diag(jnp.array([1e6, 0.0])), jnp.array([3e5, 0.0])).refine(60)
+    belief = refined(chain(2, coupling=coupling).add(jnp.diag(jnp.array([1e6, 0.0])), jnp.array([3e5, 0.0])), 60)
     assert float(belief.posterior().attached[1]) == pytest.approx(expit(logit(PROBABILITY) + coupling), rel=1e-6)
 
 
 def test_intervals_open_upwards_where_only_a_lower_end_is_known():
     mean, sd = np.array([0.0, 0.1, 0.99]), np.array([1e-3, 5e-3, 5e-2])
-    belief = chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2)).refine(30)
+    belief = refined(chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2)), 30)
     lower, upper = (np.asarray(end) for end in belief.interval())
     assert lower[0] == 0 and upper[0] < REFERENCE * 0.01
     assert lower[1] < REFERENCE * 0.1 / 0.9 < upper[1] < np.inf

@@ -66,7 +66,7 @@ class ReducedUnscented(Filter):
             precision = jnp.diag(1 / jnp.diagonal(covariance)[first])
             self._state = BoundaryBelief(precision=precision, shift=precision @ mean[first])
         stiff = jnp.where(evidence.held, self._grip_stiffness, 0.0)
-        grip = Grip(vertices=self._gripped.terms[-1].vertices, tip=pull.tip, length=pull.length, stiffness=stiff)
+        grip = Grip.of(pull.tip, pull.length, stiff)
         gripped = eqx.tree_at(lambda energy: energy.terms[-1], self._gripped, grip)
         patch = jnp.asarray(self._patch)
         self._state, x, nis, converged = update(
