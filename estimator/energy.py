@@ -77,6 +77,12 @@ class SheetEnergy(eqx.Module):
         """Gradient of U [N]; minus the force on each particle."""
         return self.internal_gradient(x) + b[:, None] * (x - self.rest)
 
+    def value_and_gradient(
+        self, x: Float[Array, "n 3"], b: Float[Array, " n"]
+    ) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
+        """Both at once."""
+        return self.value(x, b), self.gradient(x, b)
+
     def hessian(self, x: Float[Array, "n 3"], b: Float[Array, " n"], *, positive: bool = False) -> BlockTridiagonal:
         """Hessian of U [N/m]; `positive` asks for the projected one that Newton steps use."""
         elements = [

@@ -1,16 +1,29 @@
 """The sheet's equilibrium x*(b, u) = argmin U by projected Newton, differentiated by the implicit function theorem.
 
-Each step factors the positive semi-definite stand-in of the Hessian and backtracks until the energy falls enough
-(Armijo's rule). Derivatives use the true Hessian at the solution:
+Each step solves with the positive semi-definite stand-in of the Hessian, roughly if that is enough (an inexact Newton
+method [Dembo, Eisenstat & Steihaug 1982, doi:10.1137/0719025]), and backtracks until the energy falls enough (Armijo's
+rule). Derivatives use the true Hessian at the solution:
 dx/dtheta = -H^-1 d(grad U)/dtheta. A step that cannot lower the energy ends the search and is reported, not hidden.
 """
+
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
-from jiggle_mj.estimator.block_tridiagonal import add_to_diagonal, cholesky, multiply, solve
+from jiggle_mj.estimator.block_tridiagonal import (
+    BlockTridiagonal,
+    Layout,
+    add_to_diagonal,
+    cholesky,
+    multiply,
+    solve,
+)
 from jiggle_mj.estimator.energy import SheetEnergy
+
+ROUGH = 0.1
+"""Share of the unbalanced force that a step may leave in the linear model."""
 
 
 class Equilibrium(eqx.Module):
@@ -83,26 +96,39 @@ def _minimise(energy, b, start, force_tolerance, max_steps):
         matrix = energy.hessian(x, b, positive=True)
         shift = 1e-9 * jnp.max(jnp.abs(matrix.diagonal))
         matrix = add_to_diagonal(layout, matrix, jnp.broadcast_to(shift * jnp.eye(3), (len(x), 3, 3)))
-        step = solve(layout, cholesky(matrix), -gradient)
+        step = newton_step(layout, matrix, gradient)
         slope = jnp.sum(step * gradient)
 
         def too_far(trial):
-            length, new = trial
+            length, (new, _) = trial
             return (~(new <= value + 1e-4 * length * slope + 1e-15 * jnp.abs(value))) & (length > 1e-8)
 
         def halve(trial):
             length, _ = trial
-            return length / 2, energy.value(x + length / 2 * step, b)
+            return length / 2, energy.value_and_gradient(x + length / 2 * step, b)
 
-        length, new = jax.lax.while_loop(too_far, halve, (jnp.ones(()), energy.value(x + step, b)))
+        first = (jnp.ones(()), energy.value_and_gradient(x + step, b))
+        length, (new, pull) = jax.lax.while_loop(too_far, halve, first)
         stuck = length <= 1e-8
-        moved = jnp.where(stuck, x, x + length * step)
-        return moved, jnp.where(stuck, value, new), energy.gradient(moved, b), count + 1, stuck
+        moved, new, pull = jax.tree.map(partial(jnp.where, stuck), (x, value, gradient), (x + length * step, new, pull))
+        return moved, new, pull, count + 1, stuck
 
     def unfinished(state):
         _, _, gradient, count, stuck = state
         return (jnp.max(jnp.abs(gradient)) > force_tolerance) & (count < max_steps) & ~stuck
 
-    first = (start, energy.value(start, b), energy.gradient(start, b), jnp.zeros((), int), jnp.zeros((), bool))
+    first = (start, *energy.value_and_gradient(start, b), jnp.zeros((), int), jnp.zeros((), bool))
     x, _, gradient, count, _ = jax.lax.while_loop(unfinished, newton, first)
     return x, jnp.max(jnp.abs(gradient)), count
+
+
+def newton_step(layout: Layout, matrix: BlockTridiagonal, gradient: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """-A^-1 g, from a factor in single precision, in two thirds of the time, if that leaves no more than `ROUGH`."""
+    rough_matrix, rough_gradient = jax.tree.map(lambda part: part.astype(jnp.float32), (matrix, gradient))
+    rough = -solve(layout, cholesky(rough_matrix), rough_gradient).astype(gradient.dtype)
+    left = jnp.linalg.norm(multiply(layout, matrix, rough) + gradient)
+    return jax.lax.cond(
+        left <= ROUGH * jnp.linalg.norm(gradient),
+        lambda: rough,
+        lambda: -solve(layout, cholesky(matrix), gradient),
+    )

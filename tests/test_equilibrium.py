@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jiggle_mj.estimator.equilibrium import equilibrium
+from jiggle_mj.estimator.block_tridiagonal import cholesky, multiply, solve
+from jiggle_mj.estimator.equilibrium import ROUGH, equilibrium, newton_step
 from jiggle_mj.estimator.surrogate import surrogate
 from scipy.optimize import minimize
 from small_sheet import (
@@ -23,6 +24,8 @@ from small_sheet import (
     sheet,
     sheet_energy,
 )
+
+from jiggle_mj.observation import Declaration
 
 SAME_PLACE = 3e-7
 """[m]: a force tolerance of 1e-8 N over the stiffness of bending, 3e-6 N m / (7 mm)^2 = 0.06 N/m, twice."""
@@ -67,6 +70,20 @@ def test_a_search_cut_short_says_that_it_has_not_converged(lifted):
     assert not bool(short.converged)
     assert int(short.steps) == 2
     assert float(short.force) > FORCE_TOLERANCE
+
+
+def test_a_step_that_single_precision_cannot_solve_is_solved_in_double():
+    """A sheet that floats but for 1e-7 N/m a particle, against membrane edges of 30 N/m."""
+    energy, b = surrogate(sheet(), Declaration(gravity=(0.0, 0.0, 0.0), bed=False)), jnp.full(sheet().n, 1e-7)
+    x = jnp.asarray(sheet().rest) + jnp.array([[0.0, 0.0, 5e-3]])
+    matrix, gradient = energy.hessian(x, b, positive=True), energy.gradient(x, b)
+
+    def left(step):
+        return float(jnp.linalg.norm(multiply(energy.layout, matrix, step) + gradient) / jnp.linalg.norm(gradient))
+
+    rough = jax.tree.map(lambda part: part.astype(jnp.float32), (matrix, gradient))
+    assert not left(-solve(energy.layout, cholesky(rough[0]), rough[1]).astype(float)) < ROUGH
+    assert left(newton_step(energy.layout, matrix, gradient)) < 1e-3 * ROUGH
 
 
 def test_scipy_finds_the_same_minimum():
