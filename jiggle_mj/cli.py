@@ -260,7 +260,8 @@ def bench(*, sizes: tuple[int, ...] = (600, 1200), gate: bool = False, as_json: 
     """Time the estimator's parts on this machine, compile time apart; medians.
 
     Args:
-        sizes: about how many particles; the first is compared with the paper's filter too.
+        sizes: about how many particles; the first is compared with the paper's filter too, and of more than 10000 the
+            solver is timed alone.
         gate: fail where something became worse than the committed baseline allows.
         as_json: print the figures to stdout.
     """

@@ -2,6 +2,8 @@
 
 import json
 
+import numpy as np
+import pytest
 from jiggle_mj.eval import benchmark as bench
 
 
@@ -12,6 +14,14 @@ def test_a_small_benchmark_has_its_figures_and_finds_the_disc():
     assert float(metrics["update_n85_s"]["value"]) > 0
     assert float(metrics["found_share"]["value"]) > 0.75  # all called free: 0.728
     json.dumps(metrics, allow_nan=False)
+
+
+def test_beyond_the_largest_belief_the_solver_alone_is_timed(monkeypatch):
+    monkeypatch.setattr(bench, "LARGEST", 0)
+    metrics = bench.benchmark((40, 85), explicit=False, say=lambda _: None)
+    assert set(metrics) == {"device", "equilibrium_n40_s", "equilibrium_n85_s", "equilibrium_exponent"}
+    slope = np.log(metrics["equilibrium_n85_s"]["value"] / metrics["equilibrium_n40_s"]["value"]) / np.log(85 / 40)
+    assert metrics["equilibrium_exponent"]["value"] == pytest.approx(slope)
 
 
 def test_the_gate_closes_on_a_slower_time_and_on_a_share_that_falls():
