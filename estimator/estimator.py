@@ -166,8 +166,7 @@ class Estimator:
             return
         with jax.enable_x64(True), one_thread():
             if (again := self._filter.release(self._belief)) is not None:
-                self._believe(again)
-                self._converged = bool(again.converged)
+                self._judge(again)
 
     def identify(self, *, on_pass: Callable[[dict[str, float]], None] = lambda _: None) -> Material:
         """The sheet's own parameters from all frames so far; the belief becomes the one that goes with them.
@@ -186,8 +185,7 @@ class Estimator:
             factors, log_sd, stated, converged = identify(
                 self._filter, self._belief, jnp.asarray(self._b), on_pass=on_pass
             )
-            self._believe(stated)
-            self._converged = bool(stated.converged)
+            self._judge(stated)
         return material(self.declaration, factors, log_sd, converged=converged)
 
     def _update(self, observation: Observation) -> Estimate | None:
@@ -238,6 +236,11 @@ class Estimator:
 
     def _believe(self, stated: Stated) -> None:
         self._belief, self._b, self._probability = stated.belief, np.asarray(stated.b), np.asarray(stated.probability)
+
+    def _judge(self, stated: Stated) -> None:
+        """Believe what all frames together say."""
+        self._believe(stated)
+        self._converged = bool(stated.converged)
 
     def _check_begun(self) -> None:
         if self._filter is None:

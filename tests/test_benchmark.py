@@ -20,8 +20,8 @@ def test_beyond_the_largest_belief_the_solver_alone_is_timed(monkeypatch):
     monkeypatch.setattr(bench, "LARGEST", 0)
     metrics = bench.benchmark((40, 85), explicit=False, say=lambda _: None)
     assert set(metrics) == {"device", "equilibrium_n40_s", "equilibrium_n85_s", "equilibrium_exponent"}
-    slope = np.log(metrics["equilibrium_n85_s"]["value"] / metrics["equilibrium_n40_s"]["value"]) / np.log(85 / 40)
-    assert metrics["equilibrium_exponent"]["value"] == pytest.approx(slope)
+    small, large, slope = (float(metrics[f"equilibrium_{end}"]["value"]) for end in ("n40_s", "n85_s", "exponent"))
+    assert slope == pytest.approx(np.log(large / small) / np.log(85 / 40))
 
 
 def test_the_gate_closes_on_a_slower_time_and_on_a_share_that_falls():
