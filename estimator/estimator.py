@@ -124,6 +124,7 @@ class Estimator:
                 attached=self._probability > 0.5,
                 score=self._probability,
                 stiffness=self._b,
+                stiffness_sd=self._sd,
                 probabilistic=True,
                 rule=RULE,
                 converged=self._converged,
@@ -135,6 +136,7 @@ class Estimator:
             attached=self._b > limit,
             score=self._b,
             stiffness=self._b,
+            stiffness_sd=self._sd,
             rule=f"non-negative mean of b > {self.config.detect_above:g} k = {limit:.3g} N/m",
         )
 
@@ -161,6 +163,9 @@ class Estimator:
         """Say that the grasp is over: its frames are judged again in the light of all of them.
 
         Happens by itself when the jaws open or a new grasp begins; needed only where observations end with closed jaws.
+
+        Raises:
+            PerceptionError: no finite belief explains the frames together; what was believed before stays.
         """
         if self._filter is None:
             return
@@ -223,7 +228,7 @@ class Estimator:
             positions=self._x,
             observed=track.positions,
             mean=self._b,
-            sd=np.asarray(update.sd),
+            sd=self._sd,
             probability=self._probability,
             held=hold.held,
             entropy=float(update.entropy),
@@ -235,10 +240,16 @@ class Estimator:
         )
 
     def _believe(self, stated: Stated) -> None:
-        self._belief, self._b, self._probability = stated.belief, np.asarray(stated.b), np.asarray(stated.probability)
+        self._belief, self._b, self._sd = stated.belief, np.asarray(stated.b), np.asarray(stated.sd)
+        self._probability = np.asarray(stated.probability)
 
     def _judge(self, stated: Stated) -> None:
         """Believe what all frames together say."""
+        if not all(np.isfinite(part).all() for part in (stated.b, stated.sd, stated.probability)):
+            raise PerceptionError(
+                "judged again, the frames of all grasps leave no finite belief: no attachments explain them together. "
+                "What was believed before stays; leave out grasps to find the one that does not fit."
+            )
         self._believe(stated)
         self._converged = bool(stated.converged)
 
@@ -278,7 +289,8 @@ class Estimator:
         self._field = MeshField(plane.flatten(mesh.rest), mesh.faces)
         found, self._belief = build_filter(mesh, self.declaration, self.config)
         self.prior_entropy = float(self._belief.entropy())
-        self._x, self._b, self._probability = mesh.rest, np.zeros(mesh.n), np.full(mesh.n, np.nan)
+        self._x, self._b = mesh.rest, np.zeros(mesh.n)
+        self._sd = self._probability = np.full(mesh.n, np.nan)
         return found
 
     def _rest_of_points(self) -> Sheet:

@@ -39,6 +39,19 @@ class Calibration:
     """Expected calibration error of the probabilities of being attached."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Bin:
+    """Particles of which about the same probability was said."""
+
+    low: float
+    high: float
+    count: int
+    said: float
+    """Mean of their probabilities."""
+    attached: float
+    """Share of them that is attached."""
+
+
 def nees_per_dof(
     belief: Belief, stiffness: Float[np.ndarray, " n"], *, among: Bool[np.ndarray, " n"] | None = None
 ) -> float | None:
@@ -89,9 +102,26 @@ def coverage(
 
 def expected_calibration_error(probability: Float[np.ndarray, " n"], attached: Bool[np.ndarray, " n"]) -> float:
     """Mean over particles of |share attached - mean probability| of the bin that the particle falls into."""
+    bins = reliability(probability, attached)
+    return sum(one.count * abs(one.attached - one.said) for one in bins) / len(probability)
+
+
+def reliability(probability: Float[np.ndarray, " n"], attached: Bool[np.ndarray, " n"]) -> list[Bin]:
+    """What happened where a probability was said, in bins that hold a particle.
+
+    A reliability diagram [DeGroot & Fienberg 1983, doi:10.2307/2987588] in numbers.
+    """
     bin_of = np.minimum((probability * BINS).astype(int), BINS - 1)
-    surplus = np.bincount(bin_of, weights=attached - probability, minlength=BINS)
-    return float(np.abs(surplus).sum() / len(probability))
+    return [
+        Bin(
+            low=k / BINS,
+            high=(k + 1) / BINS,
+            count=int(np.sum(bin_of == k)),
+            said=float(probability[bin_of == k].mean()),
+            attached=float(attached[bin_of == k].mean()),
+        )
+        for k in np.unique(bin_of)
+    ]
 
 
 def calibration(

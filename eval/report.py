@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jiggle_mj.eval.calibration import reliability
 from jiggle_mj.eval.carrying import CarriedTruth, carry, frame_at, stiffness_at
 from jiggle_mj.eval.flat_map import grid_of, outline, plane_of, spacing
 from jiggle_mj.eval.metrics import DILATIONS, GATE_VARIANCE, agreement, distances
@@ -139,7 +140,7 @@ def _payload(
     top = max([min(float(detection.stiffness.max()), most), *finite]) or 1.0
     x, y, corners, weights = grid_of(flat, sheet.faces)
     grids = {"x": _fixed(x, 2), "y": _fixed(y, 2)}
-    fields = {"mean": detection.stiffness, "sd": last.sd}
+    fields = {"mean": detection.stiffness, "sd": detection.stiffness_sd}
     if detection.probabilistic:
         fields["probability"] = detection.score
     if carried is not None:
@@ -156,7 +157,10 @@ def _payload(
         "detected": detection.attached.astype(int).tolist(),
         "score": _significant(detection.score),
         "mean": _significant(detection.stiffness),
-        "sd": _significant(last.sd),
+        "sd": _significant(detection.stiffness_sd),
+        "interval": None
+        if belief.lower is None or belief.upper is None
+        else [_significant(belief.lower), _significant(belief.upper)],
         "faces": sheet.faces.T.tolist(),
         "series": _series(sheet, estimates, truth),
         "grasps": _grasps(estimates),
@@ -225,7 +229,7 @@ def _beside(
     carried: CarriedTruth,
 ) -> dict[str, object]:
     """Figures that `result.json` has no key for."""
-    certain = estimates[-1].sd ** 2 <= GATE_VARIANCE
+    certain = detection.stiffness_sd**2 <= GATE_VARIANCE
     true_b = stiffness_at(truth, frame_at(truth, estimates[-1].index))
     places, held_at = sheet.rest[detection.attached], truth.rest[~(true_b == 0)]
     return {
@@ -236,6 +240,7 @@ def _beside(
         "uncertain": int((~certain).sum()),
         "to_truth": distances(places, held_at),
         "to_detection": distances(held_at, places),
+        "reliability": reliability(detection.score, carried.attached) if detection.probabilistic else [],
         "rms_estimate": tracking(sheet, estimates, truth).rms_estimate,
     }
 

@@ -52,7 +52,7 @@ def result(
         scene: name of the scene or recording.
         seed: of the run.
         sensing: stereo, points, particles or cloud.
-        estimator: implicit, explicit or adam.
+        estimator: name of the filter.
         policy: who chose the pulls.
         sheet: the estimator's particles.
         estimates: one for each used frame.

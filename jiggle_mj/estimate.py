@@ -87,6 +87,8 @@ class Detection:
     """Ranks the particles, for the average precision; a probability of being attached where `probabilistic`."""
     stiffness: Float[np.ndarray, " n"]
     """The estimate of b that belongs to it [N/m]."""
+    stiffness_sd: Float[np.ndarray, " n"]
+    """Its standard deviation [N/m]; NaN where none is stated."""
     probabilistic: bool = False
     rule: str
     """In words, with its numbers; never depends on the scene's true stiffness."""

@@ -1,6 +1,7 @@
 """Whether a triangle mesh is one sheet that a membrane can be computed on.
 
-Checks connectivity and area only: neither self-intersection nor the quality of angles, which the solvers tolerate.
+Checks connectivity, area, and that no triangle faces down where the sheet at rest is seen from above, as one that is
+folded does; not the quality of angles, which the solvers tolerate.
 """
 
 import numpy as np

@@ -152,7 +152,7 @@ class Move:
 
 @dataclass(frozen=True, kw_only=True)
 class Wait:
-    """Observe once more without acting: still frames, from which noise is learned."""
+    """Observe once more without acting: a still frame."""
 
 
 Action = Grasp | Release | Move | Wait

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from jiggle_mj.eval.calibration import calibration, coverage, expected_calibration_error, nees_per_dof
+from jiggle_mj.eval.calibration import calibration, coverage, expected_calibration_error, nees_per_dof, reliability
 
 from jiggle_mj.estimate import Belief
 
@@ -51,6 +51,17 @@ def test_expected_calibration_error_by_hand():
     probability, attached = np.array([0.85, 0.85, 0.0, 0.0]), np.array([True, False, False, False])
     assert expected_calibration_error(probability, attached) == pytest.approx(0.175)
     assert expected_calibration_error(np.array([1.0, 0.0]), np.array([True, False])) == 0
+
+
+def test_reliability_lists_the_bins_that_hold_a_particle():
+    """Those of 0.85 and 0.81 share one, of which half are attached; a certainty falls into the last."""
+    bins = reliability(np.array([0.85, 0.81, 0.02, 1.0]), np.array([True, False, False, True]))
+    assert [(one.low, one.high, one.count, one.attached) for one in bins] == [
+        (0, 0.1, 1, 0),
+        (0.8, 0.9, 2, 0.5),
+        (0.9, 1, 1, 1),
+    ]
+    assert [one.said for one in bins] == pytest.approx([0.02, 0.83, 1.0])
 
 
 def test_no_probabilities_no_calibration_error():

@@ -55,7 +55,14 @@ def belief() -> Belief:
 
 def detection() -> Detection:
     score = np.linspace(0, 1, N) / 3
-    return Detection(attached=score > 0.2, score=score, stiffness=3 * score, rule="score > 0.2", probabilistic=True)
+    return Detection(
+        attached=score > 0.2,
+        score=score,
+        stiffness=3 * score,
+        stiffness_sd=score,
+        rule="score > 0.2",
+        probabilistic=True,
+    )
 
 
 def test_an_estimate_is_read_back_exactly_but_for_wall_times(tmp_path):

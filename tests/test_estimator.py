@@ -2,10 +2,14 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.estimator.belief import BoundaryBelief
+from jiggle_mj.estimator.filters.evidence import Stated
+from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
 from jiggle_mj.estimator.perception import Track
 from perception_plane import camera
 from small_sheet import DECLARATION, GRIP_RADIUS, SPACING, attached, cloud, lifts, sheet
@@ -312,6 +316,26 @@ def test_the_papers_filter_runs_behind_the_same_front():
     entropies = [estimator.prior_entropy, *(one.entropy for one in estimates)]
     assert (np.diff(entropies) < 0).all()
     assert all((one.mean >= 0).all() and np.isfinite(one.positions).all() for one in estimates)
+
+
+def test_a_belief_that_is_no_number_when_the_jaws_open_is_refused_and_the_last_one_stays(monkeypatch):
+    """The frame in which they open is skipped with the reason; another filter is told that it cannot identify."""
+    estimator = Estimator(DECLARATION, config=dataclasses.replace(CONFIG, filter="nnls"))
+    frames = episode()
+    for one in frames[:4]:
+        estimator.update(one)
+    before, none = estimator.detection, jnp.full(sheet().n, jnp.nan)
+    belief, no, yes = BoundaryBelief.prior(sheet().n, mean=0.0, sd=1.0), jnp.asarray(jnp.nan), jnp.asarray(True)
+    spoilt = Stated(belief=belief, b=none, sd=none, probability=none, entropy=no, converged=yes)
+    monkeypatch.setattr(NonNegativeLeastSquares, "release", lambda self, belief: spoilt)
+    with pytest.raises(PerceptionError, match="leave no finite belief"):
+        estimator.release()
+    opened = dataclasses.replace(frames[4], tool=dataclasses.replace(frames[4].tool, closed=False))
+    assert estimator.update(opened) is None
+    assert [index for index, why in estimator.skipped if "no finite belief" in why] == [opened.index]
+    np.testing.assert_array_equal(estimator.detection.stiffness, before.stiffness)
+    with pytest.raises(ValueError, match="only the filter 'implicit' can identify the sheet; this one is 'nnls'"):
+        estimator.identify()
 
 
 @pytest.mark.parametrize("ask", ["belief", "detection"])

@@ -1,8 +1,9 @@
-"""What every filter keeps: it sharpens if it states an uncertainty, repeats itself to the byte, and takes no notice of
-what was not seen."""
+"""What every filter keeps: it sharpens if it states an uncertainty, repeats itself to the byte, takes no notice of what
+was not seen, and forgets a frame that no state explains."""
 
 from functools import cache
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -101,6 +102,20 @@ def test_what_was_not_seen_does_not_matter(make):
     one, other = (run(make(), [frame(1), frame(2, hidden, lie)])[-1] for lie in (0.0, 0.3))
     np.testing.assert_allclose(other.belief.precision, one.belief.precision, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(other.b, one.b, atol=1e-9)
+
+
+@pytest.mark.parametrize("make", FILTERS)
+def test_a_frame_without_a_state_is_said_to_be_so_and_forgotten(make):
+    """The caller refuses it; later frames, and the opening of the jaws, go on as if it had not been."""
+    filter, good, bad = make(), [frame(1), frame(2)], frame(3)
+    bad = eqx.tree_at(lambda one: one.y, bad, bad.y * jnp.nan)
+    first = run(filter, good[:1])[-1]
+    refused = filter.update(first.belief, first.b, bad, bad.y)
+    assert not (np.isfinite(refused.x).all() and np.isfinite(refused.b).all())
+    after, as_if = filter.update(first.belief, first.b, good[1], good[1].y), run(make(), good)[-1]
+    np.testing.assert_array_equal(after.b, as_if.b)
+    if (judged := filter.release(after.belief)) is not None:
+        assert np.isfinite(judged.b).all()
 
 
 @pytest.mark.parametrize("make", [explicit, adam, unscented])

@@ -96,6 +96,6 @@ def test_what_is_found_becomes_a_declaration():
     assert "2.7" in doubtful.refused["bending"]
 
 
-def test_only_the_implicit_filter_can():
+def test_nothing_is_identified_before_the_first_grasp():
     with pytest.raises(ValueError, match="before the first frame"):
         Estimator(DECLARATION).identify()

@@ -107,17 +107,6 @@ def test_a_missing_particle_has_no_influence():
         np.testing.assert_array_equal(getattr(outs[0], name), getattr(outs[1], name))
 
 
-def test_a_frame_without_a_state_is_forgotten():
-    """What the caller refuses does not come back when the jaws open."""
-    frame, filter = lifts()[3], implicit()
-    good = observed(frame, 5)
-    bad = Evidence(y=good.y * jnp.nan, precision=good.precision, held=good.held, loaded=good.loaded)
-    out = filter.update(sheet_prior(), jnp.zeros(sheet().n), good, good.y)
-    assert not np.isfinite(filter.update(out.belief, out.b, bad, bad.y).x).all()
-    said = filter.release(out.belief)
-    assert np.isfinite(said.probability).all()
-
-
 def test_a_release_without_a_frame_since_the_last_changes_nothing():
     frame, filter = lifts()[3], implicit()
     seen = observed(frame, 5)

@@ -29,7 +29,8 @@ def test_a_disc_is_found_from_images_alone_and_scored_again_from_the_recording(t
     assert call(monkeypatch, "score", again, "--truth", recording.with_name("run.truth.mcap")) == 0
     scored = json.loads((again / "result.json").read_text())
     assert scored["detection"] == figures["detection"]
-    assert "data:image/jpeg" in (again / "report.html").read_text()
+    page = (again / "report.html").read_text()
+    assert "data:image/jpeg" in page and "Reliability of P(attached)" in page
 
 
 @pytest.mark.slow

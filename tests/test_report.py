@@ -115,7 +115,13 @@ def synthetic() -> dict:
         )
     sheet = Sheet(rest=rest, faces=faces)
     last = estimates[-1].mean
-    detection = Detection(attached=detected, score=last, stiffness=last, rule="constrained mean above 0.5 N/m")
+    detection = Detection(
+        attached=detected,
+        score=last,
+        stiffness=last,
+        stiffness_sd=estimates[-1].sd,
+        rule="constrained mean above 0.5 N/m",
+    )
     truth = Truth(
         rest=vertices, faces=triangles, attached=attached, frames=tuple(frames), scene="two lines", details={}
     )
@@ -271,7 +277,9 @@ def test_the_sentence_counts_patches_and_hits_by_hand():
     rest = np.column_stack([np.arange(10) * 0.01, np.arange(10) % 2 * 0.01, np.zeros(10)])
     sheet = Sheet(rest=rest, faces=faces)
     mask = np.isin(np.arange(10), [0, 1, 9])
-    detection = Detection(attached=mask, score=mask.astype(float), stiffness=np.full(10, 0.8), rule="")
+    detection = Detection(
+        attached=mask, score=mask.astype(float), stiffness=np.full(10, 0.8), stiffness_sd=np.full(10, 0.1), rule=""
+    )
     said = found(sheet, detection, plane_of(rest))
     assert said.startswith("3 particles are reported attached, in 2 patches (2 around x = 5 mm, y = 5 mm; 1 around x =")
     assert said.endswith("at 0.8 N/m each on average.")

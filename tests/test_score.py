@@ -23,6 +23,7 @@ DETECTION = Detection(
     attached=np.array([True, False, False, False, False, True]),
     score=np.array([3.0, 2, 0, 0, 0, 1]),
     stiffness=np.zeros(6),
+    stiffness_sd=np.full(6, 0.1),
     rule="b > 0.5",
 )
 BELIEF = Belief(mean=np.array([0.9, 0.6, 0, 0, 0, 0.2]), covariance=np.eye(6) * 0.01)

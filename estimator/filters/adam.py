@@ -9,6 +9,7 @@ states neither rate nor steps; see below. There is no uncertainty: belief, sd, e
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.belief import BoundaryBelief
@@ -43,7 +44,11 @@ class AdamShooting(Filter):
         self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:
         """Descend from b on one frame and k - 1 earlier ones; belief and start are not used."""
-        b, self._moments = descend(self._simulator, b, self._moments, self._history.add(evidence), rate=self._rate)
+        b, moments = descend(self._simulator, b, self._moments, self._history.add(evidence), rate=self._rate)
+        if np.isfinite(b).all():
+            self._moments = moments
+        else:
+            self._history.reject()
         none = not_stated(b)
         return Update(
             belief=BoundaryBelief(precision=jnp.broadcast_to(none, (len(b), len(b))), shift=none),

@@ -21,6 +21,7 @@ Where the paper has a slip or says nothing:
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
@@ -61,10 +62,14 @@ class MultipleShooting(Filter):
     ) -> Update:
         """Take one frame and k - 1 earlier ones into the belief; start is not used."""
         belief, factor, nis = update(self._simulator, belief, b, self._history.add(evidence), sweeps=SWEEPS)
+        b = non_negative(belief, b)
+        if not (np.isfinite(factor).all() and np.isfinite(nis)):
+            self._history.reject()
+            b = not_stated(b)
         return Update(
             belief=belief,
             x=evidence.y,
-            b=non_negative(belief, b),
+            b=b,
             sd=standard_deviations(factor),
             probability=not_stated(b),
             entropy=entropy(factor),

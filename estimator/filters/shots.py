@@ -66,6 +66,10 @@ class History:
         chosen += [empty] * (self._samples - len(chosen))
         return jax.tree.map(lambda *parts: jnp.concatenate(parts), *chosen)
 
+    def reject(self) -> None:
+        """Drop the latest step, which no state explains."""
+        self._shots.pop()
+
     def forget(self) -> None:
         """Set t_c to now: no later update draws a step from before."""
         self._shots.clear()

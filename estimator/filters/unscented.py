@@ -69,11 +69,13 @@ class ReducedUnscented(Filter):
         grip = Grip.of(pull.tip, pull.length, stiff)
         gripped = eqx.tree_at(lambda energy: energy.terms[-1], self._gripped, grip)
         patch = jnp.asarray(self._patch)
-        self._state, x, nis, converged = update(
+        state, x, nis, converged = update(
             gripped, patch, self._state, evidence, start, force_tolerance=jnp.asarray(self._force_tolerance)
         )
-        mean, covariance = self._state.moments()
-        theta = non_negative_minimum(self._state.precision, self._state.shift, mean > 0)
+        mean, covariance = state.moments()
+        theta = non_negative_minimum(state.precision, state.shift, mean > 0)
+        if np.isfinite(x).all() and np.isfinite(theta).all():
+            self._state = state
         variance = jnp.diagonal(covariance)
         marginals = BoundaryBelief(precision=jnp.diag(1 / variance[patch]), shift=(mean / variance)[patch])
         return Update(

@@ -1,7 +1,8 @@
-"""From stereo images to particles: tissue mask, disparity, the estimator's own mesh, and tracks of its particles.
+"""From stereo images, tracked points or clouds to particles.
 
-Data flow: `rectified` -> `tissue_mask`, `disparity` -> `sheet_mesh` -> (`material_map`, `mesh_field`) -> `flow` ->
-`registration` (with `lucas_kanade`) -> `stereo_tracker`, which holds it together.
+Of images: tissue mask, disparity, the estimator's own mesh, and tracks of its particles. Data flow: `rectified` ->
+`tissue_mask`, `disparity` -> `sheet_mesh` -> (`material_map`, `mesh_field`) -> `flow` -> `registration` (with
+`lucas_kanade`) -> `stereo_tracker`, which holds it together.
 """
 
 from jiggle_mj.estimator.perception.cloud_tracker import CloudTracker

@@ -1,7 +1,7 @@
 """From measured points with identities to particles: a mesh over the first frames, then a look-up by track id.
 
-The estimator triangulates the points anew, unless a mesh is declared. Clouds without identities are refused: matching
-the nearest surface instead of the same material point loses the attachments.
+The estimator triangulates the points anew, unless a mesh is declared. Clouds without identities go to
+`cloud_tracker`.
 """
 
 from collections import Counter

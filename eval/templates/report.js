@@ -46,9 +46,10 @@
        ["reported", (d) => d, { color: colours.seen, size: 7, symbol: "circle" }]];
   const dots = kinds.map(([name, belongs, marker]) => {
     const chosen = data.flat.map((_, i) => i).filter((i) => belongs(data.detected[i], truth && truth.attached[i]));
+    const within = (i) => (data.interval ? `<br>90 %: ${data.interval[0][i]} to ${data.interval[1][i] ?? "∞"} N/m` : "");
     const star = (i) => (truth.welded[i] ? "weld" : truth.stiffness[i] === null ? "unknown" : `${truth.stiffness[i]} N/m`);
     return { type: "scatter", mode: "markers", name: `${name} (${chosen.length})`, x: chosen.map((i) => data.flat[i][0]), y: chosen.map((i) => data.flat[i][1]), marker,
-      text: chosen.map((i) => `b ${data.mean[i]} ± ${data.sd[i]} N/m<br>score ${data.score[i]}` + (truth ? `<br>b* ${star(i)}` : "")), hovertemplate: "%{text}<extra></extra>" };
+      text: chosen.map((i) => `b ${data.mean[i]} ± ${data.sd[i]} N/m${within(i)}<br>score ${data.score[i]}` + (truth ? `<br>b* ${star(i)}` : "")), hovertemplate: "%{text}<extra></extra>" };
   });
   if (border) dots.push(border(colours.ink, 1.3));
   Plotly.newPlot("map-detected", dots, { ...flatLayout, height: 306, margin: { ...flatLayout.margin, b: 48 } }, still);
