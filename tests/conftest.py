@@ -15,7 +15,8 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import beartype.typing  # noqa: F401  # named in CHECKER
 import jax
@@ -32,6 +33,19 @@ jaxtyping.install_import_hook("jiggle_mj", CHECKER)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+MAPS = 30_000
+"""Memory maps from which on what a process compiled is dropped. Linux grants 65530, and XLA, which takes several for
+each compiled function, dies of the lack of one."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room_for_compiled_functions() -> Iterator[None]:
+    """Drop what was compiled, after a file of tests, if there is much of it."""
+    yield
+    if Path("/proc/self/maps").read_bytes().count(b"\n") > MAPS:
+        jax.clear_caches()
 
 
 @pytest.fixture
