@@ -8,10 +8,10 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -43,6 +43,7 @@ DIAGNOSTICS_SCHEMA: dict[str, object] = {
     },
     "required": ["index", "entropy", "nis", "boundary_energy", "skipped"],
 }
+Stored = TypeVar("Stored")
 COLOURS = np.array(
     [[0.267, 0.005, 0.329], [0.229, 0.322, 0.546], [0.128, 0.567, 0.551], [0.369, 0.789, 0.383], [0.993, 0.906, 0.144]]
 )
@@ -143,7 +144,7 @@ def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False
     """Read an estimate.
 
     Raises:
-        RecordingError: missing, not an MCAP, truncated, damaged, or not an estimate.
+        RecordingError: missing, not an MCAP, truncated, damaged, not an estimate, or one of another version.
     """
     path = Path(path)
     topics: dict[int, str] = {}
@@ -164,10 +165,10 @@ def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False
         raise RecordingError(f"{path} is not an estimate: it lacks {SHEET}; its topics are: {found}.")
     result = metadata.get(RESULT)
     return EstimateRecording(
-        sheet=Sheet(**arrays[SHEET]),
+        sheet=_stored(Sheet, arrays[SHEET], path),
         estimates=tuple(_parse(*pair) for pair in zip(messages[POINTS], messages[DIAGNOSTICS], strict=False)),
-        belief=Belief(**_scalars(arrays[BELIEF])) if result else None,
-        detection=Detection(**_scalars(arrays[DETECTION]), rule=result["rule"]) if result else None,
+        belief=_stored(Belief, arrays[BELIEF], path) if result else None,
+        detection=_stored(Detection, arrays[DETECTION] | {"rule": result["rule"]}, path) if result else None,
         skipped=tuple((index, why) for index, why in json.loads(result["skipped"])) if result else (),
         metadata=metadata.get(METADATA, {}),
     )
@@ -195,9 +196,17 @@ def _parse(points: Message, diagnostics: Message) -> Estimate:
     )
 
 
-def _scalars(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Arrays of no dimension as the numbers that they were."""
-    return {name: value if value.ndim else value.item() for name, value in arrays.items()}
+def _stored(kind: type[Stored], values: dict[str, Any], path: Path) -> Stored:
+    """A dataclass from what was stored of it; arrays of no dimension are the numbers that they were."""
+    known = fields(cast(Any, kind))
+    lacking = [field.name for field in known if field.default is MISSING and field.name not in values]
+    if lacking:
+        raise RecordingError(
+            f"{path} was written by another version of jiggle-mj: its {kind.__name__} lacks {', '.join(lacking)}. "
+            "Estimate again from the recording."
+        )
+    numbers = {name: value.item() if getattr(value, "ndim", 1) == 0 else value for name, value in values.items()}
+    return kind(**{field.name: numbers[field.name] for field in known if field.name in numbers})
 
 
 def _json_number(value: float) -> float | None:

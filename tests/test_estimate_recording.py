@@ -1,6 +1,6 @@
 """Estimates are read back as written, in the same bytes, and a crash leaves what came before."""
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
@@ -134,6 +134,19 @@ def test_what_is_no_estimate_is_refused(tmp_path):
         read_estimate(tmp_path / "other.mcap")
     with pytest.raises(RecordingError, match="cannot be read"):
         read_estimate(tmp_path / "missing.mcap")
+
+
+def test_an_estimate_that_lacks_what_this_version_states_is_refused(tmp_path, monkeypatch):
+    with EstimateWriter(tmp_path / "estimate.mcap", sheet(), {}) as writer:
+        writer.finish(belief(), detection())
+
+    @dataclass(frozen=True, kw_only=True)
+    class Later(Detection):
+        margin: float
+
+    monkeypatch.setattr("jiggle_mj.estimate_recording.Detection", Later)
+    with pytest.raises(RecordingError, match=r"another version of jiggle-mj.*lacks margin\. Estimate again"):
+        read_estimate(tmp_path / "estimate.mcap")
 
 
 def test_an_existing_estimate_is_not_overwritten_unasked(tmp_path):
