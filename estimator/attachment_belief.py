@@ -114,7 +114,8 @@ class AttachmentBelief(eqx.Module):
         """What is believed of each particle; call `sweep` before."""
         gaussian = self.gaussian()
         mixture, _ = self._mixture(*self._cavity(gaussian))
-        mean, sd = jnp.clip(gaussian.mean, 0, RIGID), jnp.sqrt(gaussian.variance)
+        moved = jnp.sum(self._moved(gaussian.mean), axis=1)
+        mean, sd = jnp.clip(gaussian.mean, 0, RIGID), jnp.sqrt(gaussian.variance + moved)
         return Posterior(
             mean=mean,
             sd=sd,
@@ -125,9 +126,12 @@ class AttachmentBelief(eqx.Module):
         )
 
     def moments(self) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-        """Mean and covariance of s."""
-        gaussian = self.gaussian()
-        return gaussian.mean, cho_solve((gaussian.factor, True), jnp.eye(len(self.shift), dtype=self.shift.dtype))
+        """Mean and covariance of s, with what the mesh moves between neighbours, which leaves sums alone."""
+        gaussian, rows = self.gaussian(), jnp.arange(len(self.shift))
+        covariance = cho_solve((gaussian.factor, True), jnp.eye(len(self.shift), dtype=self.shift.dtype))
+        moved = self._moved(gaussian.mean)
+        covariance = covariance.at[rows[:, None], self.prior.neighbours].add(-moved, mode="drop")
+        return gaussian.mean, covariance.at[rows, rows].add(jnp.sum(moved, axis=1))
 
     def entropy(self) -> Float[Array, ""]:
         """Of the Gaussian over s [nat]."""
@@ -135,7 +139,10 @@ class AttachmentBelief(eqx.Module):
 
     def interval(self) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """Ends of the 90 % interval of each b [N/m]: from 0 where 'free' keeps 5 %, up to infinity beyond `OPEN`."""
-        mixture, _ = self._mixture(*self._cavity(self.gaussian()))
+        gaussian = self.gaussian()
+        mixture, _ = self._mixture(*self._cavity(gaussian))
+        moved = jnp.sum(self._moved(gaussian.mean), axis=1)
+        mixture = eqx.tree_at(lambda one: one.sd, mixture, jnp.sqrt(mixture.sd**2 + moved[None]))
         free = 1 - mixture.attached > TAIL
         low, high = mixture.quantile(TAIL), mixture.quantile(1 - TAIL)
         lower = jnp.where(free, 0.0, self.stiffness(low))
@@ -152,6 +159,18 @@ class AttachmentBelief(eqx.Module):
     def _odds(self) -> Float[Array, " n"]:
         """Log odds of being attached, by the prior and what the neighbours told."""
         return self.prior.log_odds + jnp.sum(self.message, axis=1)
+
+    def _moved(self, s: Float[Array, " n"]) -> Float[Array, "n d"]:
+        """Variance of what a mesh gives to each neighbour instead of a particle.
+
+        An attachment between particles is shared by them, and a spring at each makes another sheet turn around it than
+        the attachment itself does: what fits the frames best is not the share by virtual work, in all grasps alike. How
+        much there is in all is not touched by it.
+        """
+        s = jnp.append(jnp.clip(s, 0, 1), 0.0)
+        between = (s[:-1, None] + s[self.prior.neighbours]) / 2
+        variance = (MOVED * between * (1 - between)) ** 2
+        return jnp.where(self.prior.neighbours < len(self.shift), variance, 0.0)
 
     def _cavity(self, gaussian: "Gaussian") -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """Mean and variance of each particle's s without its own site."""
@@ -217,6 +236,9 @@ class Posterior(eqx.Module):
     """Of the Gaussian over s [nat]."""
 
 
+MOVED = 0.08
+"""Share of an attachment, between it and what is free or rigid, that a mesh moves along each edge: standard deviation,
+from images of the shipped scenes."""
 RIGID = 0.999
 """No mean lies above: 1 is infinitely stiff."""
 OPEN = 0.9

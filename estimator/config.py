@@ -26,7 +26,8 @@ class EstimatorConfig:
     prior_sd: float = 1 / 75
     """Standard deviation of each attachment stiffness before anything is seen, for the other filters [k]."""
     force_sd: float = 4.5e-3
-    """Standard deviation of the force that the model gets wrong on a particle, where it is least [k x spacing]."""
+    """Standard deviation of the force that the model gets wrong on a particle [k x spacing]; of the implicit filter,
+    where forces of 0.07 k x spacing meet: it is larger in proportion where more do."""
     anchor_sd: float = 1e-4
     """How far a welded particle may be from its anchor, for the implicit filter [m]."""
     grip_sd: float = 1.5e-3

@@ -23,8 +23,8 @@ from jiggle_mj.estimate import Sheet
 from jiggle_mj.truth import Truth, TruthFrame
 
 OBSERVABLE = 2.4e-3
-"""Load from which an attachment can be told from the model's own error, four standard deviations of the force on a
-particle that the estimator's model gets wrong in the shipped scenes [N]."""
+"""Load from which an attachment can be told from the model's own error, four times `EstimatorConfig.force_sd` in the
+shipped scenes [N]."""
 PAIRS_AT_ONCE = 400_000
 """Point-triangle pairs handled together, which bounds the memory to some 100 MB."""
 

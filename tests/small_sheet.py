@@ -12,7 +12,7 @@ from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
 from jiggle_mj.estimator.filters.evidence import Evidence, Stated, Update
-from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.filters.force_balance import LEAST, ForceBalance
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.surrogate import surrogate
@@ -92,7 +92,7 @@ def sheet_balance(force_sd: float, force_level: float = np.inf) -> ForceBalance:
         sheet(),
         sheet_energy(),
         reference=k,
-        force_sd=force_sd,
+        force_sd=force_sd / LEAST,
         force_level=force_level,
         anchor_sd=1e-4,
         grip_stiffness=3 * k,

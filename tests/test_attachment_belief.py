@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jiggle_mj.estimator import attachment_belief
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
@@ -35,7 +36,8 @@ def alone(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.asarray(means), np.asarray(variances)
 
 
-def test_independent_measurements_give_each_particle_its_own_posterior():
+def test_independent_measurements_give_each_particle_its_own_posterior(monkeypatch):
+    monkeypatch.setattr(attachment_belief, "MOVED", 0.0)
     mean, variance = np.array([0.0, 0.02, 0.15, 0.9]), np.array([1e-5, 1e-4, 1e-4, 1e-2])
     belief = refined(chain(4, coupling=0.0).add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)), 30)
     expected, spread = alone(mean, variance)
@@ -103,6 +105,26 @@ def test_intervals_open_upwards_where_only_a_lower_end_is_known():
     assert lower[0] == 0 and upper[0] < REFERENCE * 0.01
     assert lower[1] < REFERENCE * 0.1 / 0.9 < upper[1] < np.inf
     assert lower[2] > 4 * REFERENCE and upper[2] == np.inf
+
+
+def test_what_the_mesh_moves_widens_each_and_leaves_sums_alone(monkeypatch):
+    """A third of what is between two neighbours, of which one is attached: as much at the free one, none of the sum."""
+    mean, variance = np.array([0.0, 0.1, 0.0]), np.full(3, 1e-6)
+    belief = chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance))
+    stated = []
+    for moved in (0.0, 1 / 3):
+        monkeypatch.setattr(attachment_belief, "MOVED", moved)
+        jax.clear_caches()
+        stated.append((np.asarray(belief.moments()[1]), belief.posterior().sd, belief.interval()))
+    (sharp, sharp_sd, sharp_interval), (wide, wide_sd, wide_interval) = stated
+    s = np.asarray(belief.moments()[0])
+    first, second = ((s[i] + s[i + 1]) / 2 * (1 - (s[i] + s[i + 1]) / 2) / 3 for i in (0, 1))
+    edges = np.array([[1, -1, 0], [0, 1, -1]]) * np.array([[first], [second]])
+    np.testing.assert_allclose(wide - sharp, edges.T @ edges, atol=1e-12)
+    np.testing.assert_allclose(wide.sum(), sharp.sum(), rtol=1e-6)
+    np.testing.assert_allclose(wide_sd**2 - sharp_sd**2, np.diagonal(edges.T @ edges), rtol=1e-6)
+    assert float(wide_interval[0][1]) < float(sharp_interval[0][1]) < float(sharp_interval[1][1])
+    assert (np.asarray(wide_interval[1]) > np.asarray(sharp_interval[1])).all()
 
 
 def test_stiffness_and_its_bounded_form_are_inverse():

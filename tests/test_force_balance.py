@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from jiggle_mj.estimator.filters import force_balance
 from jiggle_mj.estimator.filters.evidence import Evidence
-from jiggle_mj.estimator.filters.force_balance import DOUBT, FAINT, ForceBalance
+from jiggle_mj.estimator.filters.force_balance import DOUBT, FAINT, LEAST, ForceBalance
 from small_sheet import DECLARATION, attached, dense, lifts, sheet, sheet_balance, sheet_energy
 from small_sheet import observed as evidence
 
 K = DECLARATION.membrane_stiffness
-FORCE_SD, FORCE_LEVEL, ANCHOR_SD = 1e-4, 6e-3, 1e-4
+FORCE_SD, FORCE_LEVEL, ANCHOR_SD = 1e-4, 24e-3, 1e-4
 N = sheet().n
 
 
@@ -29,8 +29,8 @@ def balance() -> ForceBalance:
 def test_information_equals_the_dense_formula(balance):
     """D^T N^-1 D, -D^T N^-1 e and e^T N^-1 e over particles that are not held, with N = V + H R H^T written out.
 
-    tau grows with the sum of what the elements around a particle pull at it. D is shrunk by a multiple of the share
-    that the covariance of x given all that was seen makes up.
+    tau grows, from FORCE_SD, with the sum of what the elements around a particle pull at it. D is shrunk by a multiple
+    of the share that the covariance of x given all that was seen makes up.
     """
     frame = lifts()[3]
     seen, x = evidence(frame, 1), frame.x
@@ -52,7 +52,7 @@ def test_information_equals_the_dense_formula(balance):
     for term in sheet_energy().terms:
         for vertices, forces in zip(term.vertices, term.gradient(jnp.asarray(x)[term.vertices]), strict=True):
             flow[np.asarray(vertices)] += np.linalg.norm(forces, axis=1)
-    tau = FORCE_SD * np.sqrt(1 + (flow / FORCE_LEVEL) ** 2)
+    tau = np.sqrt(FORCE_SD**2 + (FORCE_SD / LEAST * flow / FORCE_LEVEL) ** 2)
     assert tau.max() > 1.3 * tau.min()
     V = np.diag(((1 - each) * np.repeat(tau, 3)) ** 2 + (each * K * ANCHOR_SD) ** 2)
     W = np.where(free, 1 / np.diagonal(V), 0)

@@ -16,8 +16,8 @@ from jiggle_mj.estimator.surrogate import surrogate
 from jiggle_mj.observation import Declaration
 
 FORCE_LEVEL = 0.07
-"""Forces meeting at a particle, summed, from which on the model's error grows with them [k x spacing]: to 0.064 of them
-with the default `EstimatorConfig.force_sd`."""
+"""Forces meeting at a particle, summed, of which the model gets `EstimatorConfig.force_sd` wrong [k x spacing]; its
+default is 0.064 of them."""
 
 
 def build_filter(

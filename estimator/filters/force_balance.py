@@ -37,7 +37,8 @@ from jiggle_mj.estimator.filters.tethered import Tethered
 from jiggle_mj.estimator.mesh import SheetMesh, neighbour_table, pattern
 
 ROUGH = 3.0
-"""Unbalanced force at which a state is smooth enough to be linearised at, in standard deviations of the force error."""
+"""Unbalanced force at which a state is smooth enough to be linearised at, in standard deviations of the least force
+error."""
 
 
 class ForceBalance(eqx.Module):
@@ -56,9 +57,9 @@ class ForceBalance(eqx.Module):
     own_place: Int[Array, "n 1 1"]
     """Where each particle's own window lies."""
     force_sd: Float[Array, ""]
-    """Least tau [N]; see `error`."""
+    """Tau where forces of `force_level` meet [N]; see `error`."""
     force_level: Float[Array, ""]
-    """Forces meeting at a particle from which on tau grows with them [N]."""
+    """[N]."""
     anchor_sd: Float[Array, ""]
     """sigma_a, how far a welded particle may be from its anchor [m]."""
     reference: Float[Array, ""]
@@ -116,22 +117,22 @@ class ForceBalance(eqx.Module):
 
         A mesh errs by a share of the forces that its elements bring to a particle, however well these cancel: between
         the reference's shells and the surrogate by 0.05 of the sum of their norms, from 0.3 to 20 mN. It errs alike in
-        every frame, so that where they are large the share allowed is larger; where they are small the least stays,
-        without which a sheet that hardly moves would seem to say much.
+        every frame of a grasp, and is not averaged away, so the share allowed is larger; where they are small `LEAST`
+        stays, without which a sheet that hardly moves would seem to say much.
         """
         flow = jnp.zeros(len(x), x.dtype)
         for term in self.energy.terms:
             flow = flow.at[term.vertices].add(jnp.sqrt(jnp.sum(term.gradient(x[term.vertices]) ** 2, axis=-1)))
-        return self.force_sd * jnp.sqrt(1 + (flow / self.force_level) ** 2)
+        return self.force_sd * jnp.sqrt(LEAST**2 + (flow / self.force_level) ** 2)
 
     def settle(
         self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence, *, unbalanced: float = ROUGH
     ) -> Float[Array, "n 3"]:
         """Equilibrium at fixed s of the sheet tethered to the observed positions, searched from x.
 
-        The search ends where no particle feels more than `unbalanced` standard deviations of the force error.
+        The search ends where no particle feels more than `unbalanced` standard deviations of the least force error.
         """
-        b, sd = self.reference * s / (1 - s), self.force_sd
+        b, sd = self.reference * s / (1 - s), LEAST * self.force_sd
         tolerance, stiff = unbalanced * sd, self.grip_stiffness
         return self.tethered.settle(b, evidence, x, force_sd=sd, force_tolerance=tolerance, grip_stiffness=stiff).x
 
@@ -348,6 +349,8 @@ class Information(eqx.Module):
         return self.pulled + self.precision @ self.at
 
 
+LEAST = 0.25
+"""Tau where no forces meet [force_sd]. With 1, attachments of 0.003 k are lost among it."""
 DOUBT = 3.0
 """A slope no larger than this many times its expected error says nothing. With 1, particles shielded inside a rigid
 patch, of which nothing can be known, are surely called free."""
