@@ -30,9 +30,10 @@ class Row:
     sensing: Sensing
 
 
-MAIN = (
-    *(Row(scene=scene, sensing="stereo") for scene in ("arc", "line", "u_shape", "free")),
-    *(Row(scene=scene, sensing="particles") for scene in ("arc", "line", "u_shape", "line_dot", "arc_line", "free")),
+MAIN = tuple(
+    Row(scene=scene, sensing=sensing)
+    for sensing in ("stereo", "particles")
+    for scene in ("arc", "line", "u_shape", "line_dot", "arc_line", "arc_soft", "arc_stiff", "arc_weld", "free")
 )
 """The README's table."""
 FIGURES = (
@@ -42,6 +43,8 @@ FIGURES = (
     ("PUG % exact", ("detection", "by_dilation", "0", "pug"), 100.0, 1),
     ("PCD % one ring", ("detection", "by_dilation", "1", "pcd"), 100.0, 1),
     ("PUG % one ring", ("detection", "by_dilation", "1", "pug"), 100.0, 1),
+    ("observable", ("detection", "n_observable"), 1.0, 0),
+    ("PUG % of observable, one ring", ("detection", "observable", "by_dilation", "1", "pug"), 100.0, 1),
     ("NEES/dof attached", ("calibration", "nees_attached"), 1.0, 2),
     ("coverage of 90 %, attached", ("calibration", "coverage_attached"), 1.0, 2),
     ("ECE", ("calibration", "ece"), 1.0, 3),
