@@ -5,6 +5,7 @@ estimator's own engine's, so that nothing but the estimator is needed (no MuJoCo
 """
 
 import json
+import resource
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -42,7 +43,8 @@ REPEATS = 7
 LARGEST = 10_000
 """Particles up to which the update is timed; beyond, the belief's dense n x n matrices would fill a GPU's memory."""
 SLOWER, WORSE = 3.0, 0.02
-"""What the gate lets pass: a time this many times the baseline's, and a share found that is lower by this much."""
+"""What the gate lets pass: a time this many times the baseline's, a ratio of times this many times less, and a share
+found that is lower by this much."""
 Metrics = dict[str, dict[str, float | str]]
 
 
@@ -148,7 +150,16 @@ def benchmark(sizes: tuple[int, ...], *, explicit: bool, say: Callable[[str], No
         if len(times) > 1:
             slope = np.polyfit(np.log(list(times)), np.log(list(times.values())), 1)[0]
             metrics[f"{part}_exponent"] = {"value": float(slope), "unit": "exponent of n"}
+    metrics["peak_memory"] = {"value": peak_memory(), "unit": "GiB"}
     return metrics
+
+
+def peak_memory() -> float:
+    """Most that was taken so far of a GPU's memory, or by this process where there is none [GiB]."""
+    of_device = jax.devices()[0].memory_stats()
+    if of_device is None:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return of_device["peak_bytes_in_use"] / 2**30
 
 
 def timed(call: Callable[[], object], *, repeats: int = REPEATS) -> tuple[float, float]:
@@ -166,11 +177,13 @@ def regressions(metrics: Metrics, baseline: Metrics) -> list[str]:
     """What became worse than the baseline allows, in words."""
     worse = []
     for name, entry in baseline.items():
-        if name not in metrics or entry["unit"] not in ("s", "share") or "compile" in name:
+        if name not in metrics or entry["unit"] not in ("s", "share", "ratio") or "compile" in name:
             continue
         now, then = float(metrics[name]["value"]), float(entry["value"])
         if entry["unit"] == "s" and now > SLOWER * then:
             worse.append(f"{name} is {now:.3g} s; the baseline is {then:.3g} s, and {SLOWER:g} times that is allowed.")
+        if entry["unit"] == "ratio" and now < then / SLOWER:
+            worse.append(f"{name} is {now:.3g}; the baseline is {then:.3g}, and one {SLOWER:g}th of that is allowed.")
         if entry["unit"] == "share" and now < then - WORSE:
             worse.append(f"{name} is {now:.3f}; the baseline is {then:.3f}, and {WORSE:g} less is allowed.")
     return worse
