@@ -4,7 +4,9 @@ Given the state of every particle (free, or on which rung of the ladder), the bo
 the probability of a state is a closed form. A sweep draws the state of each particle in turn, given those of all
 others, and then the shares of the rungs [collapsed Gibbs sampling for a spike and a slab: George & McCulloch 1997,
 Statistica Sinica 7:339]. Unlike expectation propagation it finds its way where several particles may carry one load,
-and has no fixed point to miss. To keep the form closed, the prior's normals are not cut off to [0, 1].
+and has no fixed point to miss. To keep the form closed, the prior's normals are not cut off to [0, 1], but for the
+particle that is looked at a rung counts by the part of its s that would lie above 0. A model that errs may ask for less
+than nothing, which the widest rung would explain best.
 
 Between two particles that change their state nothing that the others depend on changes, so all are looked at together,
 and a sweep costs a rank-one update for each change; a few of them wait to be carried out together.
@@ -13,6 +15,7 @@ and a sweep costs a rank-one update for each change; a few of them wait to be ca
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jiggle_mj.estimator.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.block_tridiagonal import lower_inverse
@@ -119,13 +122,14 @@ class Sampler(eqx.Module):
 
         def change(carried):
             state, mean, own, pending, weight, at = carried
-            apart = 1 / jnp.maximum(1 / own - precision[state], FAINT)
-            told = (apart * (mean / own - shift[state]))[None]
-            spread = apart[None] + width
+            apart = 1 / jnp.maximum(1 / own - precision[state], FAINT)[None]
+            told = apart * (mean / own - shift[state])[None]
+            spread = apart + width
+            above = log_ndtr(((told * width + centre * apart) / jnp.sqrt(spread * apart * width))[1:])
             attached = jnp.append(jnp.where(state > 0, 1.0, 0.0), 0.0)
             odds = self.prior.log_odds + self.prior.coupling * jnp.sum(attached[self.prior.neighbours], axis=1)
             seen = -0.5 * (told - centre) ** 2 / spread - 0.5 * jnp.log(spread)
-            log_weight = seen.at[1:].add(jnp.log(share)[:, None] + odds[None])
+            log_weight = seen.at[1:].add(jnp.log(share)[:, None] + odds[None] + above)
             drawn = jnp.argmax(log_weight + noise, axis=0)
             waiting = jnp.where((drawn != state) & (turn >= at), turn, n)
             i = jnp.argmin(waiting)

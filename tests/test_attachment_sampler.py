@@ -12,6 +12,7 @@ from jiggle_mj.estimator.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.attachment_sampler import Sampled, Sampler
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 from scipy.special import logit
+from scipy.stats import multivariate_normal
 
 N, PROBABILITY, COUPLING = 5, 0.1, 1.0
 EDGES = np.column_stack([np.arange(N - 1), np.arange(1, N)])
@@ -47,7 +48,7 @@ def sampled(load: float, rounds: int = ROUNDS, doublings: int = 1, even: float =
 
 
 def summed(load: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Probabilities of all states of each particle, mean and variance of s."""
+    """Probabilities of all states of each particle, whose attached s are above 0; mean and variance of s without."""
     stiffness, (precision, shift) = prior().stiffness, seen(load)
     centre, narrow = np.asarray(stiffness.mean), np.asarray(stiffness.sd) ** -2.0
     total, weight, mean, squared = 0.0, np.zeros((3, N)), np.zeros(N), np.zeros(N)
@@ -59,6 +60,8 @@ def summed(load: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         log = attached @ np.full(N, logit(PROBABILITY) + np.log(0.5)) + COUPLING * (attached[1:] @ attached[:-1])
         log += 0.5 * (np.linalg.slogdet(T)[1] + np.linalg.slogdet(covariance)[1])
         log += 0.5 * (at @ np.linalg.solve(covariance, at) - centre[state] @ T @ centre[state])
+        if (of := np.flatnonzero(attached)).size:
+            log += np.log(multivariate_normal(cov=covariance[np.ix_(of, of)]).cdf(at[of]))
         total += (p := np.exp(log))
         weight += p * (state == np.arange(3)[:, None])
         mean, squared = mean + p * at, squared + p * (at**2 + np.diag(covariance))
@@ -98,6 +101,12 @@ def test_shares_are_learned_from_those_that_are_attached():
     found = sampled(0.6, even=1.0)
     assert float(found.whole[1]) > 0.7
     assert float(jnp.sum(found.whole)) == pytest.approx(1)
+
+
+def test_what_asks_for_less_than_nothing_is_free():
+    """The widest rung, 0.3 with a spread of 0.09, lies within 5 sd of the load, free 10 away."""
+    found = sampled(-0.15)
+    assert (np.asarray(found.weight)[0, :2] > 0.99).all()
 
 
 def test_a_belief_takes_over_what_the_samples_say():
