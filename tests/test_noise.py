@@ -76,13 +76,13 @@ def test_the_filter_finds_how_noisy_positions_are(runs, times):
 
 
 def test_positions_noisier_than_stated_do_not_make_the_filter_report_what_is_not_there(runs, monkeypatch):
-    """It misses what it can no longer see; without learning it reports free particles too."""
+    """It misses what it can no longer see; without learning it reports free particles too, and is surer than right."""
     _, learned = runs[4]
     monkeypatch.setattr(Noise, "learned", lambda noise, _: noise)
     _, typed = run(4)
     wrong = [int((found(one) & ~attached()).sum()) for one in (learned, typed)]
     assert wrong[0] == 0 < wrong[1]
-    assert brier(learned) < 0.5 * brier(typed)
+    assert surprise(learned) < 0.6 * surprise(typed)
 
 
 def run(times: float) -> tuple[Noise, Stated]:
@@ -101,6 +101,7 @@ def found(stated: Stated) -> np.ndarray:
     return np.asarray(stated.probability) > 0.5
 
 
-def brier(stated: Stated) -> float:
-    """Mean squared error of P(attached)."""
-    return float(np.mean((np.asarray(stated.probability) - attached()) ** 2))
+def surprise(stated: Stated) -> float:
+    """Mean negative logarithm of what P(attached) says of the truth [nat]."""
+    of_truth = np.where(attached(), stated.probability, 1 - np.asarray(stated.probability))
+    return float(-np.mean(np.log(of_truth)))
