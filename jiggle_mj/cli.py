@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from jiggle_mj.allocator import keep_freed_memory
 from jiggle_mj.errors import ActionError, JiggleError, OutputError, SceneError
 
 if TYPE_CHECKING:
@@ -316,6 +317,7 @@ VERBS = {
 
 def main() -> None:
     """Entry point of `jiggle-mj`."""
+    keep_freed_memory()
     try:
         tyro.extras.subcommand_cli_from_dict(
             VERBS,
