@@ -39,6 +39,7 @@ LIFT, STEP = 0.03, 0.005
 """Height of the lifted corner, and by how much it rose since the frame before [m]."""
 GRIP = 6e-3
 """Radius of the jaws [m]."""
+SIZES = (600, 1200)
 REPEATS = 7
 LARGEST = 10_000
 """Particles up to which the update is timed; beyond, the belief's dense n x n matrices would fill a GPU's memory."""

@@ -39,7 +39,7 @@ from jiggle_mj.truth import Truth
 
 if TYPE_CHECKING:
     from jiggle_mj.scenes import Scene
-    from jiggle_mj.scenes.reference import Sensing
+    from jiggle_mj.scenes.observer import Sensing
 
 PACKAGES = ("jiggle-mj", "mujoco", "jax", "numpy", "scipy", "opencv-python-headless")
 
@@ -83,7 +83,7 @@ def run_scene(
     with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference:
         estimator = Estimator(reference.declaration, reference.camera, config=config, mask=mask, disparity=disparity)
         clear_directory(directory, own)
-        about = {RECORDED: scene.name, IDENTITY: recording_identity(reference, seed)}
+        about = {RECORDED: scene.name, IDENTITY: recording_identity(scene, sensing, seed)}
         frames = observe(reference, programme(scene), directory / RECORDING, seed=seed, watch=watch)
         episode = estimate(frames, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
     unscored = _result(

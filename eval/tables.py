@@ -13,7 +13,7 @@ from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.eval.experiment import run_scene
 from jiggle_mj.eval.score import Json, read_result
 from jiggle_mj.scenes import load_scene
-from jiggle_mj.scenes.reference import Sensing
+from jiggle_mj.scenes.observer import Sensing
 
 from jiggle_mj.episode import ESTIMATE, RESULT, settings
 from jiggle_mj.estimate_recording import read_estimate

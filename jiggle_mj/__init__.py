@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from jiggle_mj.camera import CameraCalibration as CameraCalibration
     from jiggle_mj.camera import StereoCamera as StereoCamera
     from jiggle_mj.errors import ActionError as ActionError
+    from jiggle_mj.errors import ClusterError as ClusterError
     from jiggle_mj.errors import JiggleError as JiggleError
     from jiggle_mj.errors import MeshError as MeshError
+    from jiggle_mj.errors import OptionError as OptionError
     from jiggle_mj.errors import OutputError as OutputError
     from jiggle_mj.errors import PerceptionError as PerceptionError
     from jiggle_mj.errors import RecordingError as RecordingError
@@ -44,11 +46,14 @@ if TYPE_CHECKING:
     from jiggle_mj.observation import Wait as Wait
     from jiggle_mj.recording import Recording as Recording
     from jiggle_mj.recording import RecordingWriter as RecordingWriter
+    from jiggle_mj.recording_series import RecordingSeries as RecordingSeries
+    from jiggle_mj.recording_series import record_series as record_series
     from jiggle_mj.scenes import Reference as Reference
     from jiggle_mj.scenes import Scene as Scene
     from jiggle_mj.scenes import load_scene as load_scene
     from jiggle_mj.scenes import programme as programme
     from jiggle_mj.scenes import shipped_scenes as shipped_scenes
+    from jiggle_mj.worker_processes import WorkerProcesses as WorkerProcesses
 
     __version__: str
 
@@ -57,6 +62,7 @@ __all__ = [
     "ActionError",
     "Belief",
     "CameraCalibration",
+    "ClusterError",
     "Declaration",
     "DeclaredMesh",
     "Detection",
@@ -70,10 +76,12 @@ __all__ = [
     "MeshError",
     "Move",
     "Observation",
+    "OptionError",
     "OutputError",
     "PerceptionError",
     "Recording",
     "RecordingError",
+    "RecordingSeries",
     "RecordingWriter",
     "Reference",
     "Release",
@@ -86,10 +94,12 @@ __all__ = [
     "StereoPair",
     "ToolState",
     "Wait",
+    "WorkerProcesses",
     "__version__",
     "import_folder",
     "load_scene",
     "programme",
+    "record_series",
     "run_estimator",
     "run_scene",
     "score",
@@ -100,8 +110,10 @@ _NAMES_OF = {
     "camera": ("CameraCalibration", "StereoCamera"),
     "errors": (
         "ActionError",
+        "ClusterError",
         "JiggleError",
         "MeshError",
+        "OptionError",
         "OutputError",
         "PerceptionError",
         "RecordingError",
@@ -129,7 +141,9 @@ _NAMES_OF = {
         "Wait",
     ),
     "recording": ("Recording", "RecordingWriter"),
+    "recording_series": ("RecordingSeries", "record_series"),
     "scenes": ("Reference", "Scene", "load_scene", "programme", "shipped_scenes"),
+    "worker_processes": ("WorkerProcesses",),
 }
 _HOME = {name: f"{__name__}.{module}" for module, names in _NAMES_OF.items() for name in names}
 

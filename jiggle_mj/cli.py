@@ -6,11 +6,11 @@ imports happen inside the verbs, so that help is quick.
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -18,12 +18,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from jiggle_mj.allocator import keep_freed_memory
-from jiggle_mj.errors import ActionError, JiggleError, OutputError, SceneError
+from jiggle_mj.errors import ActionError, JiggleError, OptionError, OutputError, SceneError
 
 if TYPE_CHECKING:
     from jiggle_mj.episode import OnFrame
     from jiggle_mj.estimate import Estimate
     from jiggle_mj.observation import Observation
+    from jiggle_mj.scenes import Scene
 
 Sensing = Literal["stereo", "points", "particles", "cloud"]
 FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
@@ -31,6 +32,7 @@ PathArgument = Annotated[Path, tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 AsJson = Annotated[bool, tyro.conf.arg(name="json")]
+Disturb = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[=MAGNITUDE]")]]
 
 console = Console(stderr=True)
 
@@ -43,6 +45,7 @@ def run(
     sensing: Sensing = "stereo",
     estimator: FilterName = "implicit",
     seed: int = 0,
+    disturb: Disturb = (),
     overwrite: bool = False,
     as_json: AsJson = False,
 ) -> None:
@@ -55,14 +58,16 @@ def run(
             noisy cloud of other points in each frame.
         estimator: implicit is ours; explicit is the paper's filter, adam its baseline; nnls and unscented are others'.
         seed: of the sensing noise.
+        disturb: something that nobody tells the estimator of, such as gravity=0.5; any number of times. The names are
+            in docs/DISTURBANCES.md.
         overwrite: replace results that are already in the folder, from the moment that the run begins.
         as_json: print result.json to stdout.
     """
     from jiggle_mj.estimator import EstimatorConfig
     from jiggle_mj.eval.experiment import run_scene
-    from jiggle_mj.scenes import load_scene, programme
+    from jiggle_mj.scenes import disturbed, load_scene, programme
 
-    loaded, config = load_scene(scene), EstimatorConfig(filter=estimator)
+    loaded, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)
     with _progress(sum(1 for _ in programme(loaded)), f"run {loaded.name}") as on_frame:
         figures = run_scene(
             loaded, out, seed=seed, sensing=sensing, config=config, overwrite=overwrite, on_frame=on_frame
@@ -77,6 +82,10 @@ def record(
     out: Out,
     sensing: Sensing = "stereo",
     seed: int = 0,
+    count: int | None = None,
+    jobs: int | None = None,
+    executor: Annotated[str | None, tyro.conf.arg(metavar="dask://HOST:PORT")] = None,
+    disturb: Disturb = (),
     overwrite: bool = False,
     as_json: AsJson = False,
 ) -> None:
@@ -84,17 +93,38 @@ def record(
 
     Args:
         scene: a shipped scene or the path of a scene file.
-        out: the recording, for example run.mcap; the truth goes to run.truth.mcap.
+        out: the recording, for example run.mcap; the truth goes to run.truth.mcap. With --count a folder, in which each
+            recording is named by its seed; what is whole there is kept.
         sensing: what is recorded.
-        seed: of the sensing noise.
+        seed: of the sensing noise; with --count of the first recording, the next has the next.
+        count: how many recordings.
+        jobs: how many at a time, each in a process of its own; as many as there are usable cores if left out.
+        executor: a Dask scheduler whose workers record instead, into a folder that all of them share.
+        disturb: something that nobody tells the estimator of, such as gravity=0.5; any number of times. The names are
+            in docs/DISTURBANCES.md.
         overwrite: replace files that are already there.
         as_json: print what was written to stdout.
     """
     from jiggle_mj.episode import observe
     from jiggle_mj.mcap_files import truth_path
-    from jiggle_mj.scenes import Reference, load_scene, programme
+    from jiggle_mj.scenes import Reference, disturbed, load_scene, programme
 
-    loaded = load_scene(scene)
+    if count is None and (jobs is not None or executor is not None):
+        raise OptionError(f"--{'jobs' if executor is None else 'executor'} is for many recordings: give --count too.")
+    loaded = disturbed(load_scene(scene), disturb)
+    if count is not None:
+        _record_series(
+            loaded,
+            out,
+            count=count,
+            jobs=jobs,
+            executor=executor,
+            sensing=sensing,
+            seed=seed,
+            overwrite=overwrite,
+            as_json=as_json,
+        )
+        return
     with (
         _progress(sum(1 for _ in programme(loaded)), f"record {loaded.name}") as on_frame,
         Reference(loaded, seed=seed, sensing=sensing, dump_dir=out.parent) as reference,
@@ -106,6 +136,55 @@ def record(
     console.print(f"wrote {out}: {n_frames} frames; the truth: {truth_path(out)}")
     if as_json:
         print(json.dumps({"recording": str(out), "truth": str(truth_path(out)), "n_frames": n_frames}))
+
+
+def _record_series(
+    scene: "Scene",
+    folder: Path,
+    *,
+    count: int,
+    jobs: int | None,
+    executor: str | None,
+    sensing: Sensing,
+    seed: int,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Many recordings of a scene; leaves with 1 where some failed, with 130 after Ctrl-C."""
+    from jiggle_mj.cluster import cluster
+    from jiggle_mj.recording_series import record_series
+    from jiggle_mj.worker_processes import WorkerProcesses
+
+    if jobs is not None and executor is not None:
+        raise OptionError("--jobs is for this machine, --executor for others: give one of them.")
+    try:
+        with (
+            WorkerProcesses(jobs) if executor is None else cluster(executor) as workers,
+            _bar(count, f"record {scene.name}") as advance,
+        ):
+            series = record_series(
+                scene,
+                folder,
+                count=count,
+                sensing=sensing,
+                seed=seed,
+                executor=workers,
+                overwrite=overwrite,
+                on_done=lambda _: advance(),
+            )
+    except KeyboardInterrupt:
+        _stop(f"interrupted; what is in {folder} is whole, and the same command, without --overwrite, goes on", 130)
+    made = len(series.recordings) - series.n_kept
+    console.print(
+        f"{folder}: {made} recordings made, {series.n_kept} kept, {len(series.failed)} failed", soft_wrap=True
+    )
+    for one, why in series.failed.items():
+        console.print(f"seed {one} failed: {why}", markup=False, highlight=False, soft_wrap=True)
+    if as_json:
+        failed = [{"seed": one, "why": why} for one, why in series.failed.items()]
+        print(json.dumps({"folder": str(folder), "recordings": [*map(str, series.recordings)], "failed": failed}))
+    if series.failed:
+        sys.exit(1)
 
 
 def import_(
@@ -257,18 +336,34 @@ def table(
         print(paper_tables.markdown(table, paper_tables.measure(table, cells, seeds or range(10), out, say=say)))
 
 
-def bench(*, sizes: tuple[int, ...] = (600, 1200), gate: bool = False, as_json: AsJson = False) -> None:
-    """Time the estimator's parts on this machine, compile time apart; medians.
+def bench(
+    part: Annotated[Literal["estimator", "reference"], tyro.conf.Positional] = "estimator",
+    /,
+    *,
+    sizes: tuple[int, ...] | None = None,
+    gate: bool = False,
+    as_json: AsJson = False,
+) -> None:
+    """Time the estimator's or the reference tissue's parts on this machine, compile time apart; medians.
 
     Args:
-        sizes: about how many particles; the first is compared with the paper's filter too, and of more than 10000 the
-            solver is timed alone.
+        part: estimator, or reference.
+        sizes: about how many particles (600, 1200 if left out; the first is compared with the paper's filter too, and
+            of more than 10000 the solver is timed alone), or vertices of the reference (300, 625, 1200, 2500).
         gate: fail where something became worse than the committed baseline allows.
         as_json: print the figures to stdout.
     """
-    from jiggle_mj.eval.benchmark import baseline, benchmark, regressions
+    from jiggle_mj.eval.benchmark import SIZES, baseline, benchmark, regressions
 
-    metrics = benchmark(sizes, explicit=True, say=lambda text: console.print(text, highlight=False))
+    def say(text: str) -> None:
+        console.print(text, highlight=False)
+
+    if part == "reference":
+        from jiggle_mj.eval import reference_benchmark as reference
+
+        metrics = reference.reference_benchmark(sizes or reference.SIZES, say=say)
+    else:
+        metrics = benchmark(sizes or SIZES, explicit=True, say=say)
     table = Table("", "figure", "", box=None)
     for name, entry in metrics.items():
         value = entry["value"]
@@ -281,6 +376,33 @@ def bench(*, sizes: tuple[int, ...] = (600, 1200), gate: bool = False, as_json: 
         console.print(line, style="red", highlight=False)
     if worse:
         sys.exit(1)
+
+
+def scene_check(scene: Name, /, *, disturb: Disturb = (), as_json: AsJson = False) -> None:
+    """Static load tests of a scene's compiled sheet: its stiffness beside the typed and the declared one.
+
+    Args:
+        scene: a shipped scene or the path of a scene file.
+        disturb: see run; those of the material that begin at 0 count.
+        as_json: print the figures to stdout.
+    """
+    from jiggle_mj.scenes import disturbed, load_scene
+    from jiggle_mj.scenes.load_tests import QUANTITIES, far_from_declared, load_tests, typed
+
+    loaded = disturbed(load_scene(scene), disturb)
+    with console.status("load tests") as status:
+        found = load_tests(loaded, say=lambda text: status.update(f"load tests: {text}"))
+    stated = typed(loaded.tissue)
+    spacings = [f"{1e3 * one.spacing:.2f} mm" for one in found]
+    table = Table("effective", "unit", "typed", *spacings, box=None)
+    for name, unit in QUANTITIES.items():
+        ratios = [f"{getattr(one, name):.4g}" for one in found]
+        table.add_row(name.replace("_", " "), unit, f"{getattr(stated, name):.4g}", *ratios)
+    console.print(table)
+    for line in far_from_declared(loaded, found):
+        console.print(line, style="yellow", markup=False, highlight=False)
+    if as_json:
+        print(json.dumps({"typed": asdict(stated), "effective": [asdict(one) for one in found]}))
 
 
 def doctor(*, as_json: AsJson = False) -> None:
@@ -311,6 +433,7 @@ VERBS = {
     "score": score,
     "table": table,
     "bench": bench,
+    "scene-check": scene_check,
     "doctor": doctor,
 }
 
@@ -324,7 +447,7 @@ def main() -> None:
             prog="jiggle-mj",
             description="Find where a tissue is attached, how strongly and how surely, from pulls seen by a camera.",
         )
-    except (SceneError, ActionError, OutputError) as failure:
+    except (SceneError, ActionError, OptionError, OutputError) as failure:
         _stop(failure, 2)
     except JiggleError as failure:
         _stop(failure, 1)
@@ -332,23 +455,30 @@ def main() -> None:
         _stop("interrupted; the recording so far is whole, and 'jiggle-mj estimate' reads it into another folder", 130)
 
 
-def _stop(failure: object, code: int) -> None:
+def _stop(failure: object, code: int) -> NoReturn:
     console.print(f"jiggle-mj: {failure}", style="red", markup=False, highlight=False, soft_wrap=True)
     sys.exit(code)
 
 
 @contextmanager
 def _progress(total: int, title: str) -> "Iterator[OnFrame]":
-    """A bar on stderr."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task(title, total=total)
+    """A bar of frames."""
+    with _bar(total, title) as advance:
 
         def on_frame(observation: "Observation", found: "Estimate | None") -> None:
             note = "" if found is None else f", entropy {found.entropy:.0f} nat"
-            bar.update(task, advance=1, description=f"{title}: grasp {observation.tool.grasp}{note}")
+            advance(f": grasp {observation.tool.grasp}{note}")
 
         yield on_frame
+
+
+@contextmanager
+def _bar(total: int, title: str) -> Iterator[Callable[..., None]]:
+    """A bar on stderr; what is given is called with a note for each part done."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(title, total=total)
+        yield lambda note="": bar.update(task, advance=1, description=title + note)
 
 
 def _show(figures: dict, out: Path, as_json: bool) -> None:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 from jiggle_mj.errors import OutputError, PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.estimate_recording import EstimateWriter
-from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.observation import Action, Observation
 from jiggle_mj.recording import Recording, RecordingWriter
@@ -22,7 +21,8 @@ from jiggle_mj.recording_declaration import identity
 from jiggle_mj.truth_recording import TruthWriter
 
 if TYPE_CHECKING:
-    from jiggle_mj.scenes import Reference
+    from jiggle_mj.estimator import Estimator, EstimatorConfig
+    from jiggle_mj.scenes import Reference, Scene
 
 RECORDING, ESTIMATE, RESULT, REPORT = "run.mcap", "estimate.mcap", "result.json", "report.html"
 
@@ -91,9 +91,11 @@ def clear_directory(directory: Path, names: Iterable[str]) -> None:
         raise OutputError(f"{directory} cannot be written ({failure.strerror}); give another folder.") from failure
 
 
-def recording_identity(reference: "Reference", seed: int) -> str:
+def recording_identity(scene: "Scene", sensing: str, seed: int) -> str:
     """Ties a recording, its truth and its estimate together: a digest of scene, sensing and seed."""
-    return identity(reference.truth().details["scene"], reference.sensing, seed)
+    from jiggle_mj.scenes import scene_table  # here, so that a recording can be estimated without MuJoCo
+
+    return identity(scene_table(scene), sensing, seed)
 
 
 def observe(
@@ -105,7 +107,7 @@ def observe(
     overwrite: bool = False,
     watch: Stopwatch | None = None,
 ) -> Iterator[Observation]:
-    """Carry out actions on the reference tissue, one observation each.
+    """Carry out actions on the reference tissue, one observation each but where a frame was lost.
 
     Args:
         reference: the tissue.
@@ -119,13 +121,14 @@ def observe(
     with ExitStack() as files:
         recording = truth_file = None
         if path is not None:
-            start, name = reference.truth(), recording_identity(reference, seed)
+            start, name = reference.truth(), recording_identity(reference.scene, reference.sensing, seed)
+            about = {"name": start.scene, "seed": str(seed), "sensing": reference.sensing, "identity": name}
             recording = files.enter_context(
                 RecordingWriter(
                     path,
                     camera=reference.camera,
                     declaration=reference.declaration,
-                    metadata={"name": start.scene, "seed": str(seed), "sensing": reference.sensing, "identity": name},
+                    metadata=about | reference.metadata,
                     overwrite=overwrite,
                 )
             )
@@ -144,6 +147,8 @@ def observe(
         for action in actions:
             with watch:
                 observation = reference.step(action)
+            if observation.lost:
+                continue
             if recording is not None and truth_file is not None:
                 recording.write(observation)
                 truth_file.write(reference.truth_frame())
@@ -152,14 +157,14 @@ def observe(
             truth_file.conclude(reference.truth().details)
 
 
-def settings(config: EstimatorConfig) -> dict[str, str]:
+def settings(config: "EstimatorConfig") -> dict[str, str]:
     """A configuration as an estimate's metadata holds it."""
     return {name: str(value) for name, value in asdict(config).items()}
 
 
 def estimate(
     observations: Iterable[Observation],
-    estimator: Estimator,
+    estimator: "Estimator",
     path: Path | None = None,
     *,
     metadata: dict[str, str] | None = None,

@@ -38,3 +38,11 @@ class SimulationError(JiggleError):
 
 class OutputError(JiggleError):
     """An output path already holds results or cannot be written."""
+
+
+class OptionError(JiggleError, ValueError):
+    """An option or argument that is out of its range, or does not go with another."""
+
+
+class ClusterError(JiggleError):
+    """The cluster that was asked for cannot be used: its package is not installed, or nothing answers there."""

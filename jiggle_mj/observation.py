@@ -70,6 +70,28 @@ class ToolState:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Cut:
+    """Cut whatever attaches a region of the sheet."""
+
+    path: Float[np.ndarray, "m 2"]
+    """Middle line of the region, in the sheet's coordinates at rest [m]; one point for a disc."""
+    width: float
+    """Of the region, across the path and around its ends [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suture:
+    """Attach a region of the sheet."""
+
+    path: Float[np.ndarray, "m 2"]
+    """See `Cut`."""
+    width: float
+    """See `Cut`."""
+    stiffness: float
+    """Intended for each particle of the region [N/m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Observation:
     """One moment: the tool, and images or measured points; where there are both, the estimator uses the images."""
 
@@ -80,6 +102,13 @@ class Observation:
     tool: ToolState
     images: StereoPair | None = None
     points: MeasuredPoints | None = None
+    events: tuple[Cut | Suture, ...] = ()
+    """What was cut or sewn since the observation before, as intended."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether nothing was seen: the frame never came, and the next one has its index."""
+        return self.images is None and self.points is None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,4 +184,4 @@ class Wait:
     """Observe once more without acting: a still frame."""
 
 
-Action = Grasp | Release | Move | Wait
+Action = Grasp | Release | Move | Wait | Cut | Suture

@@ -5,7 +5,9 @@ interpolate; which messages a file may hold is in `recording_contents`.
 """
 
 import os
+from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,6 +22,7 @@ from jiggle_mj.errors import RecordingError
 from jiggle_mj.mcap_files import McapOutput
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 from jiggle_mj.recording_contents import (
+    EVENT,
     GRASP,
     LEFT,
     LEFT_INFO,
@@ -31,6 +34,7 @@ from jiggle_mj.recording_contents import (
     RecordingContents,
 )
 from jiggle_mj.recording_declaration import METADATA, file_metadata, write_declaration
+from jiggle_mj.recording_events import EVENT_SCHEMA, event_json
 from jiggle_mj.recording_frames import camera_transforms, transform_of_rotation
 from jiggle_mj.recording_moments import Moment, Stamped, group_moments
 from jiggle_mj.recording_schemas import (
@@ -95,6 +99,8 @@ class RecordingWriter:
         output, time = self._output, observation.time
         output.message(POSE, time, pose_message(time, observation.tool))
         output.json(GRASP, time, grasp_json(observation.tool), schema=GRASP_SCHEMA)
+        for event in observation.events:
+            output.json(EVENT, time, event_json(event), schema=EVENT_SCHEMA)
         if observation.images is not None:
             if self._camera is None:
                 raise ValueError("RecordingWriter.camera is None, and the observation has images; give the camera.")
@@ -127,7 +133,7 @@ class Recording:
     """Index and reason of each unusable moment of the latest iteration, as far as it went."""
 
     def __init__(self, contents: RecordingContents, *, tolerance_ns: int, pose_age_ns: int) -> None:
-        self._contents, self._pose_age = contents, pose_age_ns
+        self._contents, self._pose_age, self._tolerance = contents, pose_age_ns, tolerance_ns
         self.camera = _read_camera(contents) if contents.has_images else None
         self.declaration, self.metadata, self.ignored = contents.declaration, contents.metadata, contents.ignored
         self.skipped = []
@@ -173,6 +179,7 @@ class Recording:
         """Usable observations in file order."""
         self.skipped = []
         latest: int | None = None
+        coming = deque(self._contents.events)
         for index, (moment, messages) in enumerate(self._messages()):
             try:
                 if latest is not None and moment.stamp <= latest:
@@ -182,7 +189,10 @@ class Recording:
             except RecordingError as failure:
                 self.skipped.append((index, str(failure)))
                 continue
-            yield observation
+            events = []
+            while coming and coming[0][0] <= moment.stamp + self._tolerance:
+                events.append(coming.popleft()[1])
+            yield replace(observation, events=tuple(events))
 
     def _messages(self) -> Iterator[tuple[Moment, dict[str, Any]]]:
         """Each moment with its images and points, still encoded; keeps only what a coming moment needs."""

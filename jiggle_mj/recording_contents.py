@@ -20,15 +20,17 @@ from mcap.records import Channel, Message, Metadata, Schema
 
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.mcap_files import iterate_records
-from jiggle_mj.observation import Declaration
+from jiggle_mj.observation import Cut, Declaration, Suture
 from jiggle_mj.recording_declaration import DECLARATION, MESH, METADATA, parse_declaration, with_mesh
+from jiggle_mj.recording_events import parse_event
 from jiggle_mj.recording_frames import FrameTree
 from jiggle_mj.recording_moments import Stamped
 from jiggle_mj.recording_schemas import parse_grasp, stamp_of
 
 LEFT, RIGHT = "/camera/left/image_raw", "/camera/right/image_raw"
 LEFT_INFO, RIGHT_INFO = "/camera/left/camera_info", "/camera/right/camera_info"
-TF, POSE, GRASP, POINTS = "/tf", "/tool/pose", "/tool/grasp", "/tissue/points"
+TF, POSE, GRASP, POINTS, EVENT = "/tf", "/tool/pose", "/tool/grasp", "/tissue/points", "/event/topology"
+AS_JSON = (GRASP, EVENT)
 SCHEMAS: dict[str, tuple[Any, ...]] = {
     LEFT: (CompressedImage, RawImage),
     RIGHT: (CompressedImage, RawImage),
@@ -38,7 +40,7 @@ SCHEMAS: dict[str, tuple[Any, ...]] = {
     POSE: (PoseInFrame,),
     POINTS: (PointCloud,),
 }
-"""The topics that are read as protobuf, and the classes allowed on each; `GRASP` is JSON."""
+"""The topics that are read as protobuf, and the classes allowed on each."""
 
 
 class RecordingContents:
@@ -57,13 +59,18 @@ class RecordingContents:
         self.poses: dict[int, PoseInFrame] = {}
         self.grasps: dict[int, dict[str, Any]] = {}
         self.stamped: dict[str, list[Stamped]] = {topic: [] for topic in (LEFT, RIGHT, POINTS, POSE, GRASP)}
+        self.events: list[tuple[int, Cut | Suture]] = []
+        """Stamp [ns] of each, in order."""
         self._classes: dict[int, Any] = {}
         ignored: Counter[str] = Counter()
         for ordinal, topic, message in self._messages():
-            if topic == GRASP or topic in SCHEMAS:
+            if topic == EVENT:
+                self.events.append((message.log_time, parse_event(message.data)))
+            elif topic == GRASP or topic in SCHEMAS:
                 self._take_in(ordinal, topic, message)
             else:
                 ignored[topic] += 1
+        self.events.sort(key=lambda stamped: stamped[0])
         self.ignored = dict(sorted(ignored.items()))
         self._refuse_incomplete()
 
@@ -132,8 +139,8 @@ class RecordingContents:
 
     def _choose_class(self, channel: Channel, schema: Schema | None) -> None:
         name, encoding = (schema.name if schema else "without a schema"), channel.message_encoding
-        if channel.topic == GRASP and encoding != "json":
-            raise RecordingError(f"{self.path}: {GRASP} is {name} ({encoding}); it must be JSON.")
+        if channel.topic in AS_JSON and encoding != "json":
+            raise RecordingError(f"{self.path}: {channel.topic} is {name} ({encoding}); it must be JSON.")
         if channel.topic not in SCHEMAS:
             return
         kinds = {kind.DESCRIPTOR.full_name: kind for kind in SCHEMAS[channel.topic]}

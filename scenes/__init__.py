@@ -7,9 +7,19 @@ with Reference(scene, seed=0, sensing="stereo") as reference:
 """
 
 from jiggle_mj.scenes import opengl as opengl  # before anything that imports mujoco
+from jiggle_mj.scenes.disturbances import DISTURBANCES, disturbed
 from jiggle_mj.scenes.programme import programme
 from jiggle_mj.scenes.reference import Reference
 from jiggle_mj.scenes.scene import Scene
 from jiggle_mj.scenes.scene_file import load_scene, scene_table, shipped_scenes
 
-__all__ = ["Reference", "Scene", "load_scene", "programme", "scene_table", "shipped_scenes"]
+__all__ = [
+    "DISTURBANCES",
+    "Reference",
+    "Scene",
+    "disturbed",
+    "load_scene",
+    "programme",
+    "scene_table",
+    "shipped_scenes",
+]

@@ -1,16 +1,17 @@
 """Where a tissue is attached: shapes in tissue coordinates, and the vertices that lie in them.
 
 A vertex is attached when it is within half the shape's width of it; attachments are the union of the shapes. Where two
-shapes meet they must agree on the stiffness, because a vertex has one.
+shapes meet they must agree on how they hold, because a vertex is held in one way.
 """
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from jiggle_mj.scenes.section import Section, number, points, stiffness, vector
 
 from jiggle_mj.errors import SceneError
@@ -24,6 +25,12 @@ def _distance_to_segment(
     return np.linalg.norm(p - start - share[:, None] * along, axis=1)
 
 
+def distance_to_path(p: Float[np.ndarray, "n 2"], path: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, " n"]:
+    """From points to an open line of straight pieces, or to the only point of it [m]."""
+    ends = pairwise(path) if len(path) > 1 else [(path[0], path[0])]
+    return np.min([_distance_to_segment(p, start, end) for start, end in ends], axis=0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Attachment(Section, ABC):
     """A shape with a width and a stiffness; the subclasses say which shape."""
@@ -31,6 +38,32 @@ class Attachment(Section, ABC):
     section: ClassVar[str] = "attachments"
     stiffness: float = stiffness()
     """Spring constant of each attached vertex [N/m]; infinity is a weld."""
+    breaks_at: float = number(0.0, unit="N", at_least=0, at_most=1e6)
+    """Largest force; 0 for any."""
+    hardening: float = number(0.0, unit="1/m^2", at_least=0, at_most=1e12)
+    """c of a force k e (1 + c e^2), e the elongation beyond the slack."""
+    slack: float = number(0.0, unit="m", at_least=0, at_most=0.05)
+    """Length up to which a spring is loose."""
+    offset: tuple[float, float, float] = vector((0.0, 0.0, 0.0), length=3, unit="m")
+    """The anchor, from where the vertex lies at rest; world."""
+    yields_at: float = number(0.0, unit="m", at_least=0, at_most=1)
+    """Largest e; beyond it the anchor comes after. 0 for any."""
+    creep: float = number(0.0, unit="1/s", at_least=0, at_most=100)
+    """Share of e by which the anchor comes after in a second."""
+
+    def __post_init__(self) -> None:
+        """Check that a weld is asked for nothing that only a spring has."""
+        super().__post_init__()
+        given = [name for name in ("hardening", "slack", "offset", "yields_at", "creep") if np.any(getattr(self, name))]
+        if math.isinf(self.stiffness) and given:
+            raise SceneError(
+                f"attachments.{given[0]} of a weld: only a spring has one; give a stiffness in N/m or leave it out."
+            )
+
+    @property
+    def law(self) -> tuple[float | tuple[float, float, float], ...]:
+        """How it holds a vertex: all that does not say where."""
+        return tuple(getattr(self, f.name) for f in fields(Attachment))
 
     @property
     def half_width(self) -> float:
@@ -122,15 +155,12 @@ class Polygon(Attachment):
 SHAPES: dict[str, type[Attachment]] = {"segment": Segment, "arc": Arc, "disc": Disc, "polygon": Polygon}
 
 
-def vertex_stiffness(
-    attachments: tuple[Attachment, ...], vertices: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, " n"]:
-    """Stiffness of the attachment at each vertex [N/m]: 0 where free, infinity where welded.
+def owners(attachments: tuple[Attachment, ...], vertices: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
+    """Which of the attachments holds each vertex; -1 where it is free.
 
     Raises:
         SceneError: a shape holds no vertex, or two shapes disagree about one.
     """
-    total = np.zeros(len(vertices))
     owner = np.full(len(vertices), -1)
     for number_, shape in enumerate(attachments):
         inside = shape.distance(vertices) <= shape.half_width
@@ -139,12 +169,29 @@ def vertex_stiffness(
                 f"attachments[{number_}] ({type(shape).__name__.lower()}) holds no vertex of the tissue: "
                 "move it onto the sheet or widen it."
             )
-        clash = np.flatnonzero(inside & (owner >= 0) & (total != shape.stiffness))
-        if clash.size:
-            x, y = vertices[clash[0]]
+        for vertex in np.flatnonzero(inside & (owner >= 0)):
+            _agree(attachments, int(owner[vertex]), number_, vertices[vertex])
+        owner[inside] = number_
+    return owner
+
+
+def _agree(attachments: tuple[Attachment, ...], one: int, other: int, place: Float[np.ndarray, " 2"]) -> None:
+    for f, a, b in zip(fields(Attachment), attachments[one].law, attachments[other].law, strict=True):
+        if a != b:
+            held = ["a weld" if value == math.inf else f"{f.name} = {value}" for value in (a, b)]
             raise SceneError(
-                f"attachments[{owner[clash[0]]}] and attachments[{number_}] give the vertex at ({x:.4f}, {y:.4f}) m "
-                f"two stiffnesses, {total[clash[0]]:g} and {shape.stiffness:g} N/m: make them equal or part them."
+                f"attachments[{one}] and attachments[{other}] contradict each other at the vertex at "
+                f"({place[0]:.4f}, {place[1]:.4f}) m: {held[0]} and {held[1]}. Make them equal or part them."
             )
-        total[inside], owner[inside] = shape.stiffness, number_
-    return total
+
+
+def vertex_stiffness(
+    attachments: tuple[Attachment, ...], vertices: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, " n"]:
+    """Stiffness of the attachment at each vertex [N/m]: 0 where free, infinity where welded.
+
+    Raises:
+        SceneError: what `owners` raises.
+    """
+    owner = owners(attachments, vertices)
+    return np.array([attachments[one].stiffness if one >= 0 else 0.0 for one in owner])

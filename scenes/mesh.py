@@ -8,7 +8,7 @@ their bending stiffness depends on the pattern.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import Delaunay
 
 from jiggle_mj.errors import MeshError
@@ -33,6 +33,12 @@ class Triangulation:
         areas = np.zeros(len(self.vertices))
         np.add.at(areas, self.faces, (triangle_areas(self.vertices, self.faces) / 3)[:, None])
         return areas
+
+    def outline(self) -> Bool[np.ndarray, " n"]:
+        """Vertices on the outer edge: those of edges that one triangle alone has."""
+        edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        single, times = np.unique(edges, axis=0, return_counts=True)
+        return np.isin(np.arange(len(self.vertices)), single[times == 1])
 
 
 def triangle_areas(vertices: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " f"]:

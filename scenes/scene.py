@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from jiggle_mj.scenes.attachments import Attachment
+from jiggle_mj.scenes.disturbance import Disturbance
 from jiggle_mj.scenes.section import Section, choice, integer, number, points, switch, vector
 
 from jiggle_mj.errors import SceneError
@@ -77,6 +78,21 @@ class Programme(Section):
     """Direction of the lift: 0 is straight up, positive leans towards the middle of the sheet."""
     lowering: int = integer(1, at_least=0, at_most=1000)
     """Increments back to the grasp point before the jaws open; 0 opens them at the top."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Procedure(Section):
+    """How cuts and sutures turn out."""
+
+    section: ClassVar[str] = "procedure"
+    cut_fails: float = number(0.0, at_least=0, at_most=1)
+    """Chance that a cut leaves everything as it was."""
+    suture_fails: float = number(0.0, at_least=0, at_most=1)
+    """Chance that a suture does not hold."""
+    suture_slack: float = number(0.0, unit="m", at_least=0, at_most=0.05)
+    """Length up to which the thread is loose."""
+    suture_offset: tuple[float, float, float] = vector((0.0, 0.0, 0.0), length=3, unit="m")
+    """Where a suture ends, from where its vertex lies at rest; world [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,8 +184,13 @@ class Scene:
     tissue: Tissue = field(default_factory=Tissue)
     bed: Bed = field(default_factory=Bed)
     attachments: tuple[Attachment, ...] = ()
+    disturbances: tuple[Disturbance, ...] = ()
+    """What nobody tells the estimator of, in the order in which they begin."""
+    secret: bool = False
+    """Whether nothing but the truth file may say that there are disturbances."""
     tweezer: Tweezer = field(default_factory=Tweezer)
     programme: Programme = field(default_factory=Programme)
+    procedure: Procedure = field(default_factory=Procedure)
     camera: Camera = field(default_factory=Camera)
     lights: Lights = field(default_factory=Lights)
     texture: Texture = field(default_factory=Texture)

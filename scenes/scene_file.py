@@ -5,16 +5,20 @@ Unknown keys, wrong types and missing files are refused with the key, the value 
 
 import math
 import tomllib
+from collections.abc import Iterator
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
 from jiggle_mj.scenes.attachments import SHAPES, Attachment
+from jiggle_mj.scenes.disturbance import Disturbance
+from jiggle_mj.scenes.disturbances import DISTURBANCES, named
 from jiggle_mj.scenes.scene import (
     Bed,
     Camera,
     Declared,
     Lights,
+    Procedure,
     Programme,
     Scene,
     Sensing,
@@ -27,7 +31,7 @@ from jiggle_mj.scenes.section import Section, checked
 from jiggle_mj.errors import SceneError
 
 SECTIONS: dict[str, type[Section]] = {
-    cls.section: cls for cls in (Tissue, Bed, Tweezer, Programme, Camera, Lights, Texture, Sensing, Declared)
+    cls.section: cls for cls in (Tissue, Bed, Tweezer, Programme, Procedure, Camera, Lights, Texture, Sensing, Declared)
 }
 FOLDER = Path(__file__).parent
 
@@ -62,26 +66,40 @@ def load_scene(name_or_path: str | Path) -> Scene:
 
 def scene_from_table(table: dict[str, Any], *, name: str) -> Scene:
     """Build a scene from parsed TOML."""
-    known = ["seed", "attachments", *SECTIONS]
+    known = ["seed", "secret", "attachments", "disturbances", *SECTIONS]
     _refuse_unknown(table, known, where="the scene")
     seed = table.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
         raise SceneError(f"seed = {seed!r}: must be a whole number in [0, 2^32).")
-    attachments = table.get("attachments", [])
-    if not isinstance(attachments, list):
-        raise SceneError(f"attachments = {attachments!r}: must be an array of tables, each headed [[attachments]].")
+    secret = table.get("secret", False)
+    if not isinstance(secret, bool):
+        raise SceneError(f"secret = {secret!r}: must be true or false.")
     sections = {key: _section(cls, table[key], where=key) for key, cls in SECTIONS.items() if key in table}
-    shapes = tuple(_attachment(entry, where=f"attachments[{i}]") for i, entry in enumerate(attachments))
-    return Scene(name=name, seed=seed, attachments=shapes, **sections)  # type: ignore[arg-type]
+    shapes = tuple(_attachment(entry, where=where) for where, entry in _tables(table, "attachments"))
+    disturbances = tuple(_disturbance(entry, where=where) for where, entry in _tables(table, "disturbances"))
+    return Scene(name=name, seed=seed, secret=secret, attachments=shapes, disturbances=disturbances, **sections)  # type: ignore[arg-type]
 
 
-def _attachment(table: object, *, where: str) -> Attachment:
-    if not isinstance(table, dict):
-        raise SceneError(f"{where} = {table!r}: must be a table headed [[attachments]].")
+def _tables(table: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The tables of an array, each with where it stands."""
+    entries = table.get(key, [])
+    if not isinstance(entries, list):
+        raise SceneError(f"{key} = {entries!r}: must be an array of tables, each headed [[{key}]].")
+    for i, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise SceneError(f"{key}[{i}] = {entry!r}: must be a table headed [[{key}]].")
+        yield f"{key}[{i}]", entry
+
+
+def _attachment(table: dict[str, Any], *, where: str) -> Attachment:
     shape = table.get("shape")
     if shape not in SHAPES:
         raise SceneError(f"{where}.shape = {shape!r}: must be one of {', '.join(map(repr, SHAPES))}.")
     return _section(SHAPES[shape], {k: v for k, v in table.items() if k != "shape"}, where=where)
+
+
+def _disturbance(table: dict[str, Any], *, where: str) -> Disturbance:
+    return _section(named(table.get("name")), {k: v for k, v in table.items() if k != "name"}, where=where)
 
 
 def _section(cls: type[Section], table: object, *, where: str) -> Any:
@@ -105,9 +123,11 @@ def _refuse_unknown(table: dict[str, Any], known: list[str], *, where: str) -> N
 
 def scene_table(scene: Scene) -> dict[str, Any]:
     """The scene as a table that could stand in a scene file; every key is written out."""
-    table: dict[str, Any] = {"seed": scene.seed}
+    table: dict[str, Any] = {"seed": scene.seed, "secret": scene.secret}
     shape_names = {cls: shape for shape, cls in SHAPES.items()}
     table["attachments"] = [{"shape": shape_names[type(shape)], **_plain(shape)} for shape in scene.attachments]
+    names = {cls: name for name, cls in DISTURBANCES.items()}
+    table["disturbances"] = [{"name": names[type(one)], **_plain(one)} for one in scene.disturbances]
     return table | {key: _plain(getattr(scene, key)) for key in SECTIONS}
 
 

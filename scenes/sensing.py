@@ -45,11 +45,9 @@ def material_tracks(sheet: Triangulation, *, n_points: int, rng: np.random.Gener
     places = lattice((float(size[0]), float(size[1])), spacing) + (low + high) / 2
     places = places + POINT_JITTER * spacing * rng.uniform(-1, 1, places.shape)
     places = rng.permutation(np.clip(places, low + 0.05 * spacing, high - 0.05 * spacing))
-    weights = barycentric(sheet, places)
-    triangle = weights.min(axis=2).argmax(axis=1)
-    rows = np.arange(len(places))
-    kept = weights[rows, triangle].min(axis=1) > -1e-9
-    return Tracks(corners=sheet.faces[triangle[kept]], weights=weights[rows, triangle][kept])
+    found = located(sheet, places)
+    kept = found.weights.min(axis=1) > -1e-9
+    return Tracks(corners=found.corners[kept], weights=found.weights[kept])
 
 
 def surface_points(sheet: Triangulation, *, n_points: int, rng: np.random.Generator) -> Tracks:
@@ -59,6 +57,19 @@ def surface_points(sheet: Triangulation, *, n_points: int, rng: np.random.Genera
     area = np.abs(ux * vy - uy * vx)
     triangle = rng.choice(len(sheet.faces), n_points, p=area / area.sum())
     return Tracks(corners=sheet.faces[triangle], weights=rng.dirichlet(np.ones(3), n_points))
+
+
+def slid(tracks: Tracks, sheet: Triangulation, by: Float[np.ndarray, " 2"]) -> Tracks:
+    """The same tracks on other material: each has slid over the sheet by as much [m], at most to its edge."""
+    places = np.einsum("mk,mkd->md", tracks.weights, sheet.vertices[tracks.corners]) + by
+    return located(sheet, np.clip(places, sheet.vertices.min(axis=0), sheet.vertices.max(axis=0)))
+
+
+def located(sheet: Triangulation, places: Float[np.ndarray, "m 2"]) -> Tracks:
+    """The material at places in the plane; beyond the outline the nearest triangle is continued."""
+    weights = barycentric(sheet, places)
+    triangle = weights.min(axis=2).argmax(axis=1)
+    return Tracks(corners=sheet.faces[triangle], weights=weights[np.arange(len(places)), triangle])
 
 
 def barycentric(sheet: Triangulation, places: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m f 3"]:

@@ -1,4 +1,4 @@
-"""Stepping the tissue to rest, with a guard against instability.
+"""The tissue in motion: MuJoCo's state, what holds the sheet, what disturbs it, and a guard against instability.
 
 At rest means that no coordinate moves faster than 1 mm/s; with implicit elasticity that takes about five steps of
 20 ms after a small move. MuJoCo's warnings are counted here instead of being appended to MUJOCO_LOG.TXT.
@@ -6,10 +6,17 @@ At rest means that no coordinate moves faster than 1 mm/s; with implicit elastic
 
 import tempfile
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
+from jiggle_mj.scenes.anchors import Anchors
+from jiggle_mj.scenes.disturbance import TissueDisturbance
+from jiggle_mj.scenes.jaws import Jaws
+from jiggle_mj.scenes.scene import Scene
+from jiggle_mj.scenes.tissue import build_tissue
 
 from jiggle_mj.errors import SimulationError
 
@@ -34,35 +41,74 @@ def _count(text: str) -> None:
 mujoco.set_mju_user_warning(_count)
 
 
-def settle(model: mujoco.MjModel, data: mujoco.MjData, *, speed: float = SETTLED, dump_dir: Path | None = None) -> bool:
-    """Step until every coordinate is slower than `speed` [m/s]; False if the cap of `MAX_STEPS` came first.
+class Simulation:
+    """One scene's tissue, from rest onwards."""
 
-    Raises:
-        SimulationError: the state became unstable; its dump is named.
-    """
-    for _ in range(MAX_STEPS):
-        mujoco.mj_step(model, data)
-        check_state(model, data, dump_dir=dump_dir)
-        if np.abs(data.qvel).max() < speed:
-            return True
-    return False
+    def __init__(self, scene: Scene, *, drawn: bool = True, dump_dir: Path | None = None) -> None:
+        """Compile the scene, start what disturbs it from the beginning, and let it come to rest; time is 0 then."""
+        self.scene, self.dump_dir = scene, dump_dir
+        self.tissue = build_tissue(scene, drawn=drawn)
+        self.model = self.tissue.model
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_forward(self.model, self.data)
+        self.anchors = Anchors(self.tissue, scene, self.data)
+        self.jaws = Jaws(self.tissue, self.data)
+        self.rules: list[Callable[[], None]] = []
+        """Called after each step."""
+        self.patience = MAX_STEPS
+        """Steps after which a frame is taken, at rest or not."""
+        mine = [one for one in scene.disturbances if isinstance(one, TissueDisturbance)]
+        self._coming = [one for one in mine if one.start == 0]
+        self.settle(speed=AT_REST, steps=MAX_STEPS)
+        self.data.time = 0.0
+        self._coming = sorted((one for one in mine if one.start > 0), key=lambda one: one.start)
 
+    def step(self) -> None:
+        """20 ms.
 
-def check_state(model: mujoco.MjModel, data: mujoco.MjData, *, dump_dir: Path | None = None) -> None:
-    """Refuse a state that is not finite or has exploded, after writing it to a file.
+        Raises:
+            SimulationError: the state became unstable; its dump is named.
+        """
+        while self._coming and self._coming[0].start <= self.data.time:
+            self._coming.pop(0).begin(self)
+        mujoco.mj_step(self.model, self.data)
+        self._check()
+        for rule in self.rules:
+            rule()
+        self.jaws.slip()
+        self.anchors.follow()
 
-    Raises:
-        SimulationError: with the path of the dump, an npz of qpos, qvel, time, mocap_pos and eq_active.
-    """
-    size, speed = np.abs(data.qpos).max(), np.abs(data.qvel).max()
-    if size < MAX_COORDINATE and speed < MAX_SPEED:
-        return
-    folder = dump_dir if dump_dir is not None else Path(tempfile.mkdtemp(prefix="jiggle-mj-"))
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "unstable_state.npz"
-    np.savez(path, qpos=data.qpos, qvel=data.qvel, time=data.time, mocap_pos=data.mocap_pos, eq_active=data.eq_active)
-    raise SimulationError(
-        f"the simulation became unstable at t = {data.time:.2f} s (largest coordinate {size:.3g} m, speed "
-        f"{speed:.3g} m/s); the state is in {path}. Lower tissue.young or the attachments' stiffness, or raise "
-        "tissue.damping."
-    )
+    def settle(self, *, speed: float = SETTLED, steps: int | None = None) -> bool:
+        """Step until every coordinate is slower than `speed` [m/s]; False if `steps` or `patience` came first."""
+        for _ in range(self.patience if steps is None else steps):
+            self.step()
+            if np.abs(self.data.qvel).max() < speed:
+                return True
+        return False
+
+    def surface(self, data: mujoco.MjData | None = None) -> Float[np.ndarray, "n 3"]:
+        """The vertices on the drawn surface, now or in `data`: moved by the flex radius along their normals [m]."""
+        vertices, faces = (self.data if data is None else data).flexvert_xpos.copy(), self.tissue.sheet.faces
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        normal = np.zeros_like(vertices)
+        for k in range(3):
+            np.add.at(normal, faces[:, k], np.cross(b - a, c - a))
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return vertices + self.scene.tissue.radius * normal
+
+    def _check(self) -> None:
+        """Refuse a state that is not finite or has exploded, after writing it to a file."""
+        data = self.data
+        size, speed = np.abs(data.qpos).max(), np.abs(data.qvel).max()
+        if size < MAX_COORDINATE and speed < MAX_SPEED:
+            return
+        folder = self.dump_dir if self.dump_dir is not None else Path(tempfile.mkdtemp(prefix="jiggle-mj-"))
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / "unstable_state.npz"
+        state = {name: getattr(data, name) for name in ("qpos", "qvel", "time", "mocap_pos", "eq_active")}
+        np.savez(path, **state)
+        raise SimulationError(
+            f"the simulation became unstable at t = {data.time:.2f} s (largest coordinate {size:.3g} m, speed "
+            f"{speed:.3g} m/s); the state is in {path}. Lower tissue.young or the attachments' stiffness, or raise "
+            "tissue.damping."
+        )

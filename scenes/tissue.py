@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 from jiggle_mj.scenes.attachments import vertex_stiffness
+from jiggle_mj.scenes.disturbance import TissueDisturbance
 from jiggle_mj.scenes.mesh import Triangulation, build_sheet
 from jiggle_mj.scenes.scene import Scene, Texture
 from jiggle_mj.scenes.stereo import add_cameras
@@ -77,6 +78,9 @@ def build_tissue(scene: Scene, *, drawn: bool = True) -> TissueModel:
     spec.attach(tool, prefix="tweezer/", frame=spec.worldbody.add_frame(pos=PARKED))
     _add_equalities(spec, stiffness)
     add_cameras(spec, scene.camera)
+    for disturbance in scene.disturbances:
+        if isinstance(disturbance, TissueDisturbance):
+            disturbance.prepare(spec)
     model = spec.compile()
     names = [f"v{i}" for i in range(len(stiffness))]
     bodies = np.array([model.body(name).id for name in names])
@@ -124,13 +128,12 @@ def _add_looks(spec: mujoco.MjSpec, scene: Scene, *, drawn: bool) -> None:
             nchannel=3,
         )
         picture.data = image.tobytes()
-        material = spec.add_material(name=name, specular=scene.lights.specular if name == "tissue" else 0.0)
+        material = spec.add_material(name=name, specular=0.0)
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-        material.shininess = 0.6
         material.texrepeat = [1, 1] if name == "tissue" else [2, 2]
     spec.worldbody.add_light(
         pos=[0.03, -0.05, 0.25], dir=[-0.1, 0.2, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        diffuse=[scene.lights.lamp] * 3, ambient=[0, 0, 0], specular=[scene.lights.specular] * 3, castshadow=False,
+        diffuse=[scene.lights.lamp] * 3, ambient=[0, 0, 0], specular=[0, 0, 0], castshadow=False,
     )  # fmt: skip
 
 

@@ -196,6 +196,7 @@ def test_a_later_grasp_off_the_tissue_is_skipped_by_name_and_keeps_what_was_lear
     assert estimator.update(episode()[6]) is not None
 
 
+@pytest.mark.slow
 def test_the_papers_edge_springs_find_the_attachments_too(run):
     """The data come from triangles, so some are missed; none further than a ring is reported."""
     estimator = Estimator(DECLARATION, config=dataclasses.replace(CONFIG, membrane="edges"))

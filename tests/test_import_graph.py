@@ -25,6 +25,7 @@ LAYER = {
     "jiggle_mj.eval": "eval",
     "jiggle_mj.episode": "episode",
     "jiggle_mj.importing": "episode",
+    "jiggle_mj.recording_series": "episode",
     "jiggle_mj.scenes": "scenes",
     "jiggle_mj.estimator": "estimator",
     "jiggle_mj.truth": "truth",

@@ -5,14 +5,15 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from jiggle_mj.estimator.estimator import RULE
-from jiggle_mj.scenes import load_scene, shipped_scenes
-from jiggle_mj.scenes.attachments import SHAPES
+from jiggle_mj.scenes import DISTURBANCES, load_scene, shipped_scenes
+from jiggle_mj.scenes.attachments import SHAPES, Attachment
 from jiggle_mj.scenes.scene import Scene
 from jiggle_mj.scenes.scene_file import SECTIONS, scene_from_table
 from jiggle_mj.scenes.section import Section, checked
@@ -25,6 +26,8 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 SCENES = (ROOT / "docs" / "SCENES.md").read_text(encoding="utf-8")
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 
+TABLES: dict[str, type[Section]] = {**SECTIONS, "attachments": Attachment, **SHAPES}
+"""What docs/SCENES.md has a table for."""
 RIGHT_AT_LEAST = 0.6
 """Precision and recall of the example, exact and on a mesh of its own; the bar is the README's for exact scores."""
 RUN_AND_KEEP = """
@@ -65,11 +68,17 @@ def documented(page: str) -> dict[str, dict[str, tuple[str, str]]]:
     found: dict[str, dict[str, tuple[str, str]]] = {}
     for part in re.split(r"^(?=##+ )", page, flags=re.MULTILINE)[1:]:
         heading = part.partition("\n")[0]
-        named = re.search(r'`(?:\[|shape = ")(\w+)["\]]', heading)
+        named = re.search(r'`(?:\[+|shape = ")(\w+)["\]]', heading)
         rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|", part, re.MULTILINE)
         if named:
             found[named[1]] = {key: (default, allowed) for key, default, allowed in rows}
     return found
+
+
+def own(section: type[Section]) -> list[Field[Any]]:
+    """The fields of a table; a shape's are those that not every shape has."""
+    shared = {f.name for f in fields(Attachment)} if section in SHAPES.values() else set()
+    return [f for f in fields(section) if f.name not in shared]
 
 
 def refusal(section: type[Section], key: str) -> str:
@@ -132,18 +141,19 @@ def test_the_readme_states_the_detection_rule():
 
 
 def test_scenes_md_names_exactly_the_sections_and_keys():
-    known = {name: {f.name for f in fields(cls)} for name, cls in {**SECTIONS, **SHAPES}.items()}
+    known = {name: {f.name for f in own(cls)} for name, cls in TABLES.items()}
     tables = documented(SCENES)
-    assert tables.pop("attachments", {}) == {}, "its keys are those of the shapes"
+    assert tables.pop("disturbances", {}) == {}, "in a page of their own"
     assert {name: set(keys) for name, keys in tables.items()} == known
-    assert set(SECTIONS) | {"name", "seed", "attachments"} == {f.name for f in fields(Scene)}
+    top = {"name", "seed", "secret", "attachments", "disturbances"}
+    assert set(SECTIONS) | top == {f.name for f in fields(Scene)}
 
 
-@pytest.mark.parametrize("name", [*SECTIONS, *SHAPES])
+@pytest.mark.parametrize("name", TABLES)
 def test_scenes_md_states_each_default_and_range(name: str):
     """The default is TOML for the field's default; what is allowed is in the words of the refusal."""
-    section = {**SECTIONS, **SHAPES}[name]
-    for field in fields(section):
+    section = TABLES[name]
+    for field in own(section):
         default, allowed = documented(SCENES)[name][field.name]
         assert allowed == refusal(section, field.name), field.name
         if field.default is MISSING:
@@ -151,6 +161,19 @@ def test_scenes_md_states_each_default_and_range(name: str):
         else:
             stated = tomllib.loads(f"it = {default.strip('`')}")["it"]
             assert checked(field, stated, where=name) == field.default, field.name
+
+
+@pytest.mark.parametrize("name", DISTURBANCES)
+def test_disturbances_md_states_each_default_and_range(name: str):
+    """One row for the magnitude, one for each further key; `start` is the same for all."""
+    page = (ROOT / "docs" / "DISTURBANCES.md").read_text(encoding="utf-8")
+    rows = re.findall(rf"^\| `{name}(\.\w+)?` \| `(.*?)` \| (.*?) \|", page, re.MULTILINE)
+    stated = {key.removeprefix(".") or "magnitude": (default, allowed) for key, default, allowed in rows}
+    known = {f.name: f for f in fields(DISTURBANCES[name]) if f.name != "start"}
+    assert set(stated) == set(known)
+    for key, (default, allowed) in stated.items():
+        assert allowed == refusal(DISTURBANCES[name], key), key
+        assert checked(known[key], tomllib.loads(f"it = {default}")["it"], where=name) == known[key].default, key
 
 
 def test_the_worked_example_of_scenes_md_is_a_scene_and_declares_its_own_tissue():

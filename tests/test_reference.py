@@ -33,7 +33,7 @@ def particles(scene: Scene = SCENE, seed: int = 0) -> Reference:
 
 def net_force(reference: Reference) -> np.ndarray:
     """Sum over the sheet of springs, weight and constraints (grip, bed, welds) [N]; elastic forces cancel."""
-    model, data, tissue = reference._tissue.model, reference._data, reference._tissue
+    model, data, tissue = reference._simulation.tissue.model, reference._simulation.data, reference._simulation.tissue
     mujoco.mj_forward(model, data)
     stretch = data.qpos[tissue.qpos_address] - model.qpos_spring[tissue.qpos_address]
     springs = -np.where(np.isfinite(tissue.stiffness), tissue.stiffness, 0)[:, None] * stretch
@@ -50,7 +50,7 @@ def test_a_hanging_sheet_stretches_its_springs_by_its_weight():
         reference = particles(scene)
         for _ in range(10):
             reference.step(Wait())
-        data, tissue = reference._data, reference._tissue
+        data, tissue = reference._simulation.data, reference._simulation.tissue
         drop = -data.qpos[tissue.qpos_address[:, 2]]
         weight = TISSUE.density * TISSUE.thickness * np.prod(TISSUE.size) * 9.81
         # The sheet is let go from unstretched springs; a second later what is left of the fall is below 1e-5 of it.
@@ -59,7 +59,7 @@ def test_a_hanging_sheet_stretches_its_springs_by_its_weight():
 
 def test_the_compiled_sheet_weighs_density_times_volume():
     """m = rho * t * Lx * Ly, each vertex a third of its triangles."""
-    model = particles()._tissue.model
+    model = particles()._simulation.tissue.model
     flesh = [model.body_mass[model.body(f"v{i}").id] for i in range(model.nflexvert)]
     assert sum(flesh) == pytest.approx(TISSUE.density * TISSUE.thickness * np.prod(TISSUE.size), rel=1e-12)
 
@@ -73,16 +73,16 @@ def test_a_strip_pulled_at_both_ends_has_the_typed_modulus():
     tissue = Tissue(size=(length, width), spacing=6e-3)
     ends = tuple(Disc(centre=(x, 0.0), radius=0.02, stiffness=math.inf) for x in (-length / 2, length / 2))
     reference = particles(dataclasses.replace(SCENE, tissue=tissue, attachments=ends, bed=Bed(friction=0.0)))
-    model, data = reference._tissue.model, reference._data
-    rest = reference._tissue.sheet.vertices
-    right = np.flatnonzero(np.isinf(reference._tissue.stiffness) & (rest[:, 0] > 0))
-    left = np.flatnonzero(np.isinf(reference._tissue.stiffness) & (rest[:, 0] < 0))
+    model, data = reference._simulation.tissue.model, reference._simulation.data
+    rest = reference._simulation.tissue.sheet.vertices
+    right = np.flatnonzero(np.isinf(reference._simulation.tissue.stiffness) & (rest[:, 0] > 0))
+    left = np.flatnonzero(np.isinf(reference._simulation.tissue.stiffness) & (rest[:, 0] < 0))
     for i in right:
         model.eq_data[model.equality(f"weld{i}").id, 3] += 0.01 * length
     for _ in range(5):
         reference.step(Wait())
-    dofs = model.jnt_dofadr[reference._tissue.joints]
-    moved = data.qpos[reference._tissue.qpos_address[:, 0]]
+    dofs = model.jnt_dofadr[reference._simulation.tissue.joints]
+    moved = data.qpos[reference._simulation.tissue.qpos_address[:, 0]]
     inner = np.abs(rest[:, 0]) < 0.025
     strain = np.polyfit(rest[inner, 0], moved[inner], 1)[0]
     force = abs(data.qfrc_constraint[dofs[left, 0]].sum())
@@ -134,7 +134,7 @@ def test_a_weld_stays_where_it_is_while_a_corner_is_lifted():
     reference.step(Grasp(point=CORNER, radius=8e-3))
     reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.02])))
     attached = reference.truth().attached
-    moved = np.linalg.norm(reference._data.flexvert_xpos - rest + [0, 0, TISSUE.radius], axis=1)
+    moved = np.linalg.norm(reference._simulation.data.flexvert_xpos - rest + [0, 0, TISSUE.radius], axis=1)
     # Measured 0.30 mm where the pull is strongest: the constraint is stiff, not rigid.
     assert moved[attached].max() < 5e-4
     assert np.isinf(reference.truth_frame().stiffness[attached]).all()
@@ -155,8 +155,8 @@ def test_a_springs_load_is_its_stretch_and_a_welds_what_a_stiff_spring_would_car
     reference = particles()
     reference.step(Grasp(point=CORNER, radius=8e-3))
     reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.02])))
-    frame, joints = reference.truth_frame(), reference._tissue.qpos_address
-    stretched = np.linalg.norm(reference._data.qpos[joints], axis=1)
+    frame, joints = reference.truth_frame(), reference._simulation.tissue.qpos_address
+    stretched = np.linalg.norm(reference._simulation.data.qpos[joints], axis=1)
     np.testing.assert_allclose(frame.load, frame.stiffness * stretched, atol=1e-12)
     weld, spring = lifted_load(math.inf), lifted_load(300.0)
     assert weld.max() == pytest.approx(spring.max(), rel=0.1)
@@ -192,7 +192,7 @@ def test_the_bed_is_not_passed():
     reference = particles()
     for action in programme(SCENE):
         reference.step(action)
-        assert reference._data.flexvert_xpos[:, 2].min() > 0
+        assert reference._simulation.data.flexvert_xpos[:, 2].min() > 0
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not():
@@ -278,7 +278,7 @@ def test_actions_with_impossible_numbers_are_refused(action):
 
 def test_an_unstable_state_is_dumped_and_named(tmp_path):
     reference = Reference(SCENE, seed=0, sensing="particles", dump_dir=tmp_path)
-    reference._data.qpos[7] = np.nan
+    reference._simulation.data.qpos[7] = np.nan
     with pytest.raises(SimulationError, match=r"unstable_state\.npz"):
         reference.step(Wait())
     assert np.isnan(np.load(tmp_path / "unstable_state.npz")["qpos"][7])
@@ -289,7 +289,7 @@ def test_mujocos_warnings_are_counted_and_write_no_file(tmp_path, tmp_path_facto
     monkeypatch.chdir(tmp_path)
     before = sum(simulation.warnings.values())
     reference = Reference(SCENE, seed=0, sensing="particles", dump_dir=dumps)
-    reference._data.qpos[0] = np.nan
+    reference._simulation.data.qpos[0] = np.nan
     with pytest.raises(SimulationError):
         reference.step(Wait())
     assert list(tmp_path.iterdir()) == []
@@ -299,12 +299,12 @@ def test_mujocos_warnings_are_counted_and_write_no_file(tmp_path, tmp_path_facto
 def test_the_tweezer_touches_nothing_and_its_jaws_close():
     """Holding is done by constraints: no contact involves a tool geom, and the jaw joints reach their set angle."""
     reference = particles()
-    model, data = reference._tissue.model, reference._data
+    model, data = reference._simulation.tissue.model, reference._simulation.data
     tool = {i for i in range(model.ngeom) if model.geom(i).name.startswith("tweezer/")}
-    wide = [data.qpos[model.jnt_qposadr[j]] for j in reference._tissue.jaws]
+    wide = [data.qpos[model.jnt_qposadr[j]] for j in reference._simulation.tissue.jaws]
     reference.step(Grasp(point=CORNER, radius=8e-3))
     reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.01])))
-    narrow = [data.qpos[model.jnt_qposadr[j]] for j in reference._tissue.jaws]
+    narrow = [data.qpos[model.jnt_qposadr[j]] for j in reference._simulation.tissue.jaws]
     assert tool and not tool & set(data.contact.geom.ravel().tolist())
     assert min(wide) > 0.2 and max(np.abs(narrow)) < 0.02
 

@@ -67,6 +67,7 @@ def test_one_grasp_is_the_beginning_of_four():
         np.testing.assert_array_equal(a.positions, b.positions)
 
 
+@pytest.mark.slow
 def test_our_filter_finds_the_attachments_of_its_own_engine():
     """Within one ring, with a small force error stated, as the data come from the estimator's own model."""
     found = made("equilibrium")

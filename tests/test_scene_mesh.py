@@ -104,9 +104,21 @@ def test_shapes_unite_and_free_vertices_stay_free():
 
 
 def test_shapes_that_disagree_about_a_vertex_are_refused():
-    shapes = tuple(Disc(centre=(0.0, 0.0), radius=0.001, stiffness=k) for k in (2.0, 3.0))
-    with pytest.raises(SceneError, match=r"attachments\[0\] and attachments\[1\].*2 and 3 N/m"):
-        vertex_stiffness(shapes, PLACES)
+    """The message says in what; a weld and a spring on one vertex are the plainest contradiction."""
+    for one, other, said in (
+        ({"stiffness": 2.0}, {"stiffness": 3.0}, r"stiffness = 2\.0 and stiffness = 3\.0"),
+        ({"stiffness": 2.0}, {"stiffness": math.inf}, r"stiffness = 2\.0 and a weld"),
+        ({"stiffness": 2.0}, {"stiffness": 2.0, "slack": 1e-3}, r"slack = 0\.0 and slack = 0\.001"),
+    ):
+        shapes = tuple(Disc(centre=(0.0, 0.0), radius=0.001, **law) for law in (one, other))
+        with pytest.raises(SceneError, match=rf"attachments\[0\] and attachments\[1\] contradict .*: {said}"):
+            vertex_stiffness(shapes, PLACES)
+
+
+@pytest.mark.parametrize("key", ["hardening", "slack", "yields_at", "creep"])
+def test_a_weld_has_nothing_of_a_spring(key):
+    with pytest.raises(SceneError, match=rf"attachments\.{key} of a weld"):
+        Disc(centre=(0.0, 0.0), radius=0.001, stiffness=math.inf, **{key: 1e-3})
 
 
 def test_a_shape_off_the_sheet_is_refused():

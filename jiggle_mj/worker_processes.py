@@ -1,0 +1,155 @@
+"""Processes that work side by side, each of which may die without taking the others with it.
+
+`concurrent.futures.ProcessPoolExecutor` stops all its processes when one of them dies, and is of no use from then on.
+Here the dead process loses the one call that it was at, and the next call gets a new process. Processes are spawned:
+neither OpenGL nor JAX survives a fork.
+"""
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from queue import LifoQueue
+from types import TracebackType
+from typing import Any, TypeVar
+
+from jiggle_mj.errors import OptionError
+
+T = TypeVar("T")
+SPAWN = multiprocessing.get_context("spawn")
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class WorkerProcesses(Executor):
+    """An executor of processes; leaving its `with` by an exception stops them at once, else the calls are waited for.
+
+    Functions, arguments and results are pickled. As with every spawned process, a script that makes one does so under
+    `if __name__ == "__main__":`. The call whose process dies raises `BrokenExecutor`; it may be submitted again.
+
+    Args:
+        count: how many processes at most; None for one on each usable core.
+
+    Raises:
+        OptionError: fewer than 1.
+    """
+
+    def __init__(self, count: int | None = None) -> None:
+        if count is not None and count < 1:
+            raise OptionError(f"jobs = {count}: must be at least 1.")
+        count = count or usable_cores()
+        self._workers = [_Worker() for _ in range(count)]
+        self._idle: LifoQueue[_Worker] = LifoQueue()
+        for worker in self._workers:
+            self._idle.put(worker)
+        self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker-process")
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Schedule a call."""
+        return self._threads.submit(self._call, fn, args, kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Take no more calls; with `wait`, return when all are done and the processes have ended."""
+        self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
+        if wait:
+            for worker in self._workers:
+                worker.end()
+
+    def stop(self) -> None:
+        """End the processes now; a call under way cleans up as it does after any exception."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for worker in self._workers:
+            worker.terminate()
+        self.shutdown()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if error is None:
+            self.shutdown()
+        else:
+            self.stop()
+
+    def _call(self, fn: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any]) -> T:
+        worker = self._idle.get()
+        try:
+            return worker.call(fn, args, kwargs)
+        finally:
+            self._idle.put(worker)
+
+
+class _Worker:
+    """One process at a time, started when it is first needed, and anew after it died."""
+
+    def __init__(self) -> None:
+        self._running: tuple[SpawnProcess, Connection] | None = None
+        self._stopped = False
+        self._lock = threading.Lock()
+
+    def call(self, fn: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any]) -> T:
+        """Have a call carried out there.
+
+        Raises:
+            BrokenExecutor: the process died, or none is to be started any more.
+        """
+        process, ours = self._started()
+        try:
+            ours.send((fn, args, kwargs))
+            returned, value = ours.recv()
+        except (EOFError, OSError) as death:
+            self.end()
+            raise BrokenExecutor(f"a worker process died (exit code {process.exitcode})") from death
+        if returned:
+            return value
+        raise value
+
+    def terminate(self) -> None:
+        """End the process, and start none again."""
+        with self._lock:
+            self._stopped = True
+            if self._running is not None:
+                self._running[0].terminate()
+
+    def end(self) -> None:
+        """Tell the process, by closing its pipe, that nothing more comes, and wait for it."""
+        with self._lock:
+            if self._running is not None:
+                process, ours = self._running
+                ours.close()
+                process.join()
+                self._running = None
+
+    def _started(self) -> tuple[SpawnProcess, Connection]:
+        with self._lock:
+            if self._stopped:
+                raise BrokenExecutor("the worker processes have been stopped")
+            if self._running is None:
+                ours, theirs = SPAWN.Pipe()
+                process = SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
+                process.start()
+                theirs.close()
+                self._running = process, ours
+            return self._running
+
+
+def _serve(connection: Connection) -> None:
+    """Carry out calls until the pipe is closed; SIGTERM ends one as `sys.exit` does, Ctrl-C is the parent's affair."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    while True:
+        try:
+            fn, args, kwargs = connection.recv()
+        except EOFError:
+            return
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+        try:
+            answer = (True, fn(*args, **kwargs))
+        except Exception as failure:
+            answer = (False, failure)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        connection.send(answer)

@@ -1,0 +1,48 @@
+"""What a disturbance is: something that happens to the tissue or to the sensing, and the estimator is not told of it.
+
+A subclass names its magnitude with unit, default and range, and changes the simulation or the observer when its time
+has come.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import mujoco
+from jiggle_mj.scenes.section import Section, number
+
+if TYPE_CHECKING:
+    from jiggle_mj.scenes.observer import Observer
+    from jiggle_mj.scenes.simulation import Simulation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbance(Section):
+    """One effect; `magnitude` is what the command line sets."""
+
+    section: ClassVar[str] = "disturbances"
+    magnitude: float
+    start: float = number(0.0, unit="s", at_least=0, at_most=1e6)
+    """When it begins; at 0 it is there before the sheet first comes to rest."""
+
+
+class TissueDisturbance(Disturbance, ABC):
+    """Of the sheet, what it lies on, what holds it."""
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:  # most need nothing
+        """Change what must be known when the scene is compiled."""
+
+    @abstractmethod
+    def begin(self, simulation: "Simulation") -> None:
+        """Change the model, or add a rule to be followed after each step."""
+
+
+class SensingDisturbance(Disturbance, ABC):
+    """Of the camera, the tracker or the tool's report."""
+
+    needs: ClassVar[tuple[str, ...]] = ()
+    """The kinds of sensing that it can disturb; none named, all."""
+
+    @abstractmethod
+    def begin(self, observer: "Observer") -> None:
+        """Change what is seen or reported from now on."""
