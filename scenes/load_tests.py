@@ -177,7 +177,7 @@ def upward_stiffness(simulation: Simulation, vertices: Int[np.ndarray, " m"]) ->
     for height in heights:
         data.qpos[tissue.qpos_address] = 0.0
         data.qpos[height] = NUDGE
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
+        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_flex, mujoco.mj_passive):
+            stage(model, data)
         columns.append(-data.qfrc_spring[forces] / NUDGE)
     return np.column_stack(columns)
