@@ -5,7 +5,10 @@ it. Whether a context can be made is known only when a renderer is built: see `s
 """
 
 import os
+import sys
 
+TOO_LATE = "mujoco" in sys.modules and "MUJOCO_GL" not in os.environ
+"""MuJoCo was imported without a backend before this package was."""
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 BACKEND = os.environ["MUJOCO_GL"]
@@ -26,6 +29,8 @@ except (AttributeError, ImportError, OSError) as error:
 
 def no_opengl(error: Exception) -> str:
     """What to tell someone whose machine has no offscreen OpenGL, in one line."""
+    if TOO_LATE:
+        return "No offscreen OpenGL: mujoco was imported before jiggle_mj. Import jiggle_mj first, or set MUJOCO_GL=egl."
     cause = error.__cause__ or error
     reason = (str(cause).splitlines() or [type(cause).__name__])[0].rstrip(".")
     return (

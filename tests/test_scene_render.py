@@ -153,3 +153,17 @@ def test_a_context_that_cannot_be_made_is_a_render_error(monkeypatch):
     monkeypatch.setattr(mujoco, "Renderer", fail)
     with pytest.raises(RenderError, match=r"No offscreen OpenGL: MUJOCO_GL=\w+ failed \(no EGL device\)"):
         StereoRenderer(mujoco.MjModel.from_xml_string("<mujoco/>"), Camera())
+
+
+def test_mujoco_imported_too_early_is_named_as_the_cause():
+    code = """
+import mujoco
+import jiggle_mj as jm
+try:
+    jm.Reference(jm.load_scene("arc"), seed=0, sensing="stereo")
+except jm.RenderError as error:
+    print(error)
+"""
+    environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert "mujoco was imported before jiggle_mj" in done.stdout, done.stderr
