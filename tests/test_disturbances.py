@@ -8,8 +8,10 @@ import pytest
 from jiggle_mj.scenes import DISTURBANCES, Reference, disturbed
 from jiggle_mj.scenes.attachments import Disc
 from jiggle_mj.scenes.disturbance import TissueDisturbance
-from jiggle_mj.scenes.scene import Scene, Tissue
+from jiggle_mj.scenes.load_tests import hold
+from jiggle_mj.scenes.scene import Bed, Scene, Tissue
 from jiggle_mj.scenes.scene_file import scene_from_table
+from jiggle_mj.scenes.simulation import Simulation
 
 from jiggle_mj.errors import SceneError
 from jiggle_mj.observation import Grasp, Move, Wait
@@ -99,6 +101,43 @@ def test_a_leaning_bed_carries_a_leaning_sheet():
     table = {"disturbances": [{"name": "bed", "magnitude": 0.0, "tilt_deg": 3.0, "azimuth_deg": 180.0}]}
     x, _, z = lifted(scene=dataclasses.replace(SCENE, disturbances=_read(table)))[0].positions.T
     assert np.polyfit(x, z, 1)[0] == pytest.approx(np.tan(np.radians(3.0)), rel=0.05)
+
+
+WEIGHTLESS = disturbed(
+    Scene(name="floating", tissue=Tissue(size=(0.06, 0.06), spacing=8e-3), bed=Bed(present=False)), ["gravity=0"]
+)
+
+
+@pytest.mark.parametrize(("uniaxial", "direction_deg"), [(0.0, 0.0), (1.0, 30.0)])
+def test_a_floating_sheet_shrinks_by_its_pre_strain(uniaxial, direction_deg):
+    """Everywhere alike: in all directions, or along the one that was asked for."""
+    pre_strain = DISTURBANCES["pre_strain"](magnitude=0.03, uniaxial=uniaxial, direction_deg=direction_deg)
+    scene = dataclasses.replace(WEIGHTLESS, disturbances=(*WEIGHTLESS.disturbances, pre_strain))
+    simulation = Simulation(scene, drawn=False)
+    simulation.settle(speed=1e-7)
+    place = simulation.tissue.sheet.vertices
+    homogeneous = np.column_stack([place, np.ones(len(place))])
+    found, *_ = np.linalg.lstsq(homogeneous, place + simulation.anchors.moved[:, :2])
+    np.testing.assert_allclose(homogeneous @ found, place + simulation.anchors.moved[:, :2], atol=2e-6)
+    along = np.array([np.cos(np.radians(direction_deg)), np.sin(np.radians(direction_deg))])
+    across = np.array([-along[1], along[0]])
+    assert along @ found[:2] @ along == pytest.approx(0.97, abs=3e-4)
+    assert across @ found[:2] @ across == pytest.approx(1.0 if uniaxial else 0.97, abs=3e-4)
+
+
+@pytest.mark.parametrize("stretch", [0.02, 0.05])
+def test_strain_stiffening_multiplies_the_force_by_what_it_says(stretch):
+    """1 + 400 E^2, of a sheet that is drawn out along x alone; E = e + e^2 / 2."""
+    forces = []
+    for texts in ([], ["strain_stiffening=400"]):
+        simulation = Simulation(disturbed(WEIGHTLESS, texts), drawn=False)
+        sheet, springs = simulation.tissue.sheet, simulation.anchors.attachments
+        drawn_out = stretch * np.column_stack([sheet.vertices[:, 0], np.zeros((len(sheet.vertices), 2))])
+        hold(simulation, sheet.outline(), drawn_out)
+        simulation.settle(speed=1e-7)
+        pull = springs.stiffness * (springs.anchor - simulation.anchors.moved)[:, 0]
+        forces.append(sheet.vertices[:, 0] @ pull)
+    assert forces[1] / forces[0] == pytest.approx(1 + 400 * (stretch + stretch**2 / 2) ** 2, rel=1e-3)
 
 
 def test_broken_attachments_are_gone_and_carry_nothing():
