@@ -93,6 +93,7 @@ def run_scene(
         sensing=sensing,
         estimator=estimator.config.filter,
         policy="corners",
+        disturbances=reference.metadata.get("disturbances"),
         simulation_s=watch.seconds,
     )
     write_result(directory / RESULT, unscored)
@@ -146,6 +147,7 @@ def run_estimator(
         sensing=recording.metadata.get("sensing", "points" if recording.camera is None else "stereo"),
         estimator=estimator.config.filter,
         policy="recorded",
+        disturbances=recording.metadata.get("disturbances"),
     )
     write_result(directory / RESULT, figures)
     _report(directory, episode, figures, recording=recording_path)
@@ -232,6 +234,7 @@ def _result(
     sensing: str,
     estimator: str,
     policy: str,
+    disturbances: str | None,
     simulation_s: float | None = None,
 ) -> Json:
     return result(
@@ -240,6 +243,7 @@ def _result(
         sensing=sensing,
         estimator=estimator,
         policy=policy,
+        disturbances=disturbances,
         sheet=episode.sheet,
         estimates=episode.estimates,
         detection=episode.detection,

@@ -38,6 +38,7 @@ def result(
     sensing: str,
     estimator: str,
     policy: str,
+    disturbances: str | None = None,
     sheet: Sheet,
     estimates: Sequence[Estimate],
     detection: Detection,
@@ -54,6 +55,7 @@ def result(
         sensing: stereo, points, particles or cloud.
         estimator: name of the filter.
         policy: who chose the pulls.
+        disturbances: as the recording's metadata has them; None where it says nothing.
         sheet: the estimator's particles.
         estimates: one for each used frame.
         detection: what is called attached.
@@ -70,6 +72,7 @@ def result(
         "sensing": sensing,
         "estimator": estimator,
         "policy": policy,
+        "disturbances": disturbances,
         "n_particles": len(sheet.rest),
         "n_frames": n_frames,
         "detection": {

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from jiggle_mj.importing import import_folder as import_folder
     from jiggle_mj.material import Material as Material
     from jiggle_mj.observation import Action as Action
+    from jiggle_mj.observation import Cut as Cut
     from jiggle_mj.observation import Declaration as Declaration
     from jiggle_mj.observation import DeclaredMesh as DeclaredMesh
     from jiggle_mj.observation import Grasp as Grasp
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from jiggle_mj.observation import Observation as Observation
     from jiggle_mj.observation import Release as Release
     from jiggle_mj.observation import StereoPair as StereoPair
+    from jiggle_mj.observation import Suture as Suture
     from jiggle_mj.observation import ToolState as ToolState
     from jiggle_mj.observation import Wait as Wait
     from jiggle_mj.recording import Recording as Recording
@@ -63,6 +65,7 @@ __all__ = [
     "Belief",
     "CameraCalibration",
     "ClusterError",
+    "Cut",
     "Declaration",
     "DeclaredMesh",
     "Detection",
@@ -92,6 +95,7 @@ __all__ = [
     "SimulationError",
     "StereoCamera",
     "StereoPair",
+    "Suture",
     "ToolState",
     "Wait",
     "WorkerProcesses",
@@ -129,6 +133,7 @@ _NAMES_OF = {
     "material": ("Material",),
     "observation": (
         "Action",
+        "Cut",
         "Declaration",
         "DeclaredMesh",
         "Grasp",
@@ -137,6 +142,7 @@ _NAMES_OF = {
         "Observation",
         "Release",
         "StereoPair",
+        "Suture",
         "ToolState",
         "Wait",
     ),

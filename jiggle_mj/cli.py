@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -18,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from jiggle_mj.allocator import keep_freed_memory
-from jiggle_mj.errors import ActionError, JiggleError, OptionError, OutputError, SceneError
+from jiggle_mj.errors import JiggleError, OptionError, OutputError, SceneError
 
 if TYPE_CHECKING:
     from jiggle_mj.episode import OnFrame
@@ -396,13 +397,14 @@ def scene_check(scene: Name, /, *, disturb: Disturb = (), as_json: AsJson = Fals
     spacings = [f"{1e3 * one.spacing:.2f} mm" for one in found]
     table = Table("effective", "unit", "typed", *spacings, box=None)
     for name, unit in QUANTITIES.items():
-        ratios = [f"{getattr(one, name):.4g}" for one in found]
+        ratios = ["too coarse" if isnan(value := getattr(one, name)) else f"{value:.4g}" for one in found]
         table.add_row(name.replace("_", " "), unit, f"{getattr(stated, name):.4g}", *ratios)
     console.print(table)
     for line in far_from_declared(loaded, found):
         console.print(line, style="yellow", markup=False, highlight=False)
     if as_json:
-        print(json.dumps({"typed": asdict(stated), "effective": [asdict(one) for one in found]}))
+        plain = [{key: None if isnan(value) else value for key, value in asdict(one).items()} for one in found]
+        print(json.dumps({"typed": asdict(stated), "effective": plain}))
 
 
 def doctor(*, as_json: AsJson = False) -> None:
@@ -447,7 +449,7 @@ def main() -> None:
             prog="jiggle-mj",
             description="Find where a tissue is attached, how strongly and how surely, from pulls seen by a camera.",
         )
-    except (SceneError, ActionError, OptionError, OutputError) as failure:
+    except (SceneError, OptionError, OutputError) as failure:
         _stop(failure, 2)
     except JiggleError as failure:
         _stop(failure, 1)

@@ -3,6 +3,7 @@
 Dask is the optional extra `cluster`. The workers need this package, of the same version, and the same folders.
 """
 
+import logging
 import re
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -13,6 +14,8 @@ from jiggle_mj.errors import ClusterError, OptionError
 URL = r"dask://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):(\d{1,5})"
 PATIENCE = "10s"
 """How long the scheduler may take to answer."""
+WORKERS_WITHIN = 30
+"""Seconds after which there must be a worker."""
 
 
 @contextmanager
@@ -24,7 +27,7 @@ def cluster(url: str) -> Iterator[Executor]:
 
     Raises:
         OptionError: the URL is none of these.
-        ClusterError: Dask is not installed, or no scheduler answers.
+        ClusterError: Dask is not installed, no scheduler answers, or it has no workers.
     """
     place = re.fullmatch(URL, url)
     if place is None or int(place[2]) > 65535:
@@ -43,6 +46,14 @@ def cluster(url: str) -> Iterator[Executor]:
             "'dask worker HOST:PORT --nworkers auto --nthreads 1'."
         ) from failure
     with client:
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # each lost call is reported by its seed
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_WITHIN)
+        except TimeoutError as failure:
+            raise ClusterError(
+                f"the scheduler at {url} has no workers. Start some with 'dask worker HOST:PORT --nworkers auto "
+                "--nthreads 1', then repeat the command."
+            ) from failure
         executor = client.get_executor(pure=False)
         try:
             yield executor

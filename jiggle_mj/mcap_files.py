@@ -10,6 +10,7 @@ import json
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self, cast
@@ -42,7 +43,7 @@ class McapOutput:
     """Writes messages, metadata and arrays, with the caller's times only: the wall clock never enters the file.
 
     Raises:
-        OutputError: the path exists and `overwrite` is false, or it cannot be written.
+        OutputError: the path exists and `overwrite` is false, or it cannot be written, from whatever method finds out.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -56,7 +57,8 @@ class McapOutput:
         except OSError as failure:
             raise OutputError(f"{self.path} cannot be written: {failure.strerror}.") from failure
         self._writer = Writer(self._file)
-        self._writer.start(profile="")
+        with self._disk():
+            self._writer.start(profile="")
         self._channels: dict[str, int] = {}
 
     def __enter__(self) -> Self:
@@ -82,28 +84,42 @@ class McapOutput:
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """Write a metadata record, keys sorted."""
-        self._writer.add_metadata(name, dict(sorted(values.items())))
+        with self._disk():
+            self._writer.add_metadata(name, dict(sorted(values.items())))
 
     def arrays(self, name: str, arrays: dict[str, np.ndarray]) -> None:
         """Write arrays as an npz attachment; numpy dates its members 1980, so the bytes are the arrays' alone."""
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **arrays)
-        self._writer.add_attachment(
-            create_time=0, log_time=0, name=name, media_type=NPZ_MEDIA_TYPE, data=buffer.getvalue()
-        )
+        with self._disk():
+            self._writer.add_attachment(
+                create_time=0, log_time=0, name=name, media_type=NPZ_MEDIA_TYPE, data=buffer.getvalue()
+            )
 
     def flush(self) -> None:
         """Hand everything so far to the operating system, as whole records."""
-        self._writer.flush()
+        with self._disk():
+            self._writer.flush()
 
     def close(self) -> None:
         """Write the index and close the file; a second call does nothing."""
         if not self._file.closed:
-            self._writer.finish()
-            self._file.close()
+            with self._disk():
+                self._writer.finish()
+                self._file.close()
 
     def _add(self, topic: str, time: int, data: bytes) -> None:
-        self._writer.add_message(self._channels[topic], log_time=int(time), publish_time=int(time), data=data)
+        with self._disk():
+            self._writer.add_message(self._channels[topic], log_time=int(time), publish_time=int(time), data=data)
+
+    @contextmanager
+    def _disk(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as failure:
+            with suppress(OSError):
+                self._file.close()
+            raise OutputError(f"{self.path} cannot be written on: {failure.strerror}.") from failure
 
 
 def read_arrays(attachment: Attachment, path: Path) -> dict[str, np.ndarray]:

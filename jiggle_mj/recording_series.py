@@ -28,6 +28,7 @@ from jiggle_mj.worker_processes import WorkerProcesses
 
 TRIES = 3
 """How many workers may die at a recording before it is given up."""
+CANCELLED = "its executor cancelled it, as one does that was stopped or lost its scheduler"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +56,7 @@ class _Order:
 
 def record_series(
     scene: Scene,
-    folder: Path,
+    folder: Path | str,
     *,
     count: int,
     sensing: Sensing = "stereo",
@@ -72,6 +73,7 @@ def record_series(
     Args:
         scene: what is recorded.
         folder: where the files go; for executors on other machines, a folder that they share under this name.
+            Recordings of other seeds that are there stay, whatever they are of.
         count: how many.
         sensing: what is recorded.
         seed: of the first recording's sensing noise.
@@ -89,6 +91,7 @@ def record_series(
         JiggleError: what would befall every recording: the scene is impossible, no OpenGL. What is whole stays.
         KeyboardInterrupt: what has not begun is cancelled; what is whole stays.
     """
+    folder = Path(folder)
     if count < 1:
         raise OptionError(f"count = {count}: must be at least 1.")
     if seed < 0:
@@ -139,7 +142,7 @@ def _carry_out(orders: list[_Order], executor: Executor, on_done: Callable[[int]
         while pending:
             future = finished.get()
             order = pending.pop(future)
-            failure = CancelledError("its executor cancelled it") if future.cancelled() else future.exception()
+            failure = CancelledError(CANCELLED) if future.cancelled() else future.exception()
             if failure is None:
                 on_done(order.seed)
             elif isinstance(failure, BrokenExecutor):
@@ -191,9 +194,8 @@ def _is_whole(order: _Order) -> bool:
     except RecordingError as failure:
         raise OutputError(f"the place of seed {order.seed} is taken: {failure} {remedy}") from failure
     if said.get("identity") != recording_identity(order.scene, order.sensing, order.seed):
-        raise OutputError(
-            f"{order.path} is not seed {order.seed} of this scene from {order.sensing}; it says: scene "
-            f"{said.get('name', 'unknown')!r}, sensing {said.get('sensing', 'unknown')!r}, seed "
-            f"{said.get('seed', 'unknown')}. {remedy}"
-        )
+        asked = {"name": order.scene.name, "sensing": order.sensing, "seed": str(order.seed)}
+        found = {key: said.get(key, "unknown") for key in asked}
+        why = "a scene of that name with other contents or disturbances" if found == asked else f"{found}, not {asked}"
+        raise OutputError(f"{order.path} is of {why}. {remedy}")
     return truth_path(order.path).exists()

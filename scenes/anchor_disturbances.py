@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jiggle_mj.scenes.disturbance import TissueDisturbance
+from jiggle_mj.scenes.disturbance import TissueDisturbance, meet_sheet
 from jiggle_mj.scenes.section import number, vector
 from jiggle_mj.scenes.springs import Springs
 
@@ -17,13 +17,13 @@ class AnchorShift(TissueDisturbance):
     """All anchors lie beside where the sheet lay at rest, and pull at it from the start."""
 
     magnitude: float = number(2e-3, unit="m", at_least=0, at_most=0.05)
-    direction: tuple[float, float, float] = vector((0.0, 0.0, -1.0), length=3)
+    direction: tuple[float, float, float] = vector((0.0, 0.0, -1.0), length=3, direction=True)
     """Which way, world; its length does not count. A sheet that nothing else holds follows a shift along the bed."""
 
     def begin(self, simulation: "Simulation") -> None:
         """Move the springs' ends; a weld has none."""
         way, springs = np.array(self.direction), simulation.anchors.attachments
-        springs.anchor = springs.anchor + self.magnitude * way / max(float(np.linalg.norm(way)), 1e-12)
+        springs.anchor = springs.anchor + self.magnitude * way / np.linalg.norm(way)
         simulation.anchors.write()
 
 
@@ -126,6 +126,10 @@ class PointPull(TissueDisturbance):
     """Of the spot."""
     towards: tuple[float, float, float] = vector((0.01, 0.0, -0.002), length=3, unit="m")
     """Where the pull would end, from where the spot lies at rest."""
+
+    def check(self, size: tuple[float, float]) -> None:
+        """Refuse a spot off the sheet."""
+        meet_sheet(size, self.at, self.radius, what="point_pull.at")
 
     def begin(self, simulation: "Simulation") -> None:
         """Add the springs."""

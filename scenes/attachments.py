@@ -7,7 +7,7 @@ shapes meet they must agree on how they hold, because a vertex is held in one wa
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import ClassVar
 
 import numpy as np
@@ -29,6 +29,16 @@ def distance_to_path(p: Float[np.ndarray, "n 2"], path: Float[np.ndarray, "m 2"]
     """From points to an open line of straight pieces, or to the only point of it [m]."""
     ends = pairwise(path) if len(path) > 1 else [(path[0], path[0])]
     return np.min([_distance_to_segment(p, start, end) for start, end in ends], axis=0)
+
+
+def _cross(*corners: tuple[float, float]) -> bool:
+    """Whether two segments a-b and c-d cross within both."""
+    a, b, c, d = map(np.array, corners)
+
+    def side(p: Float[np.ndarray, " 2"], q: Float[np.ndarray, " 2"], r: Float[np.ndarray, " 2"]) -> float:
+        return float((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
+
+    return side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +91,7 @@ class Segment(Attachment):
 
     start: tuple[float, float] = vector(length=2, unit="m")
     end: tuple[float, float] = vector(length=2, unit="m")
-    width: float = number(unit="m", above=0)
+    width: float = number(unit="m", above=0, at_most=1)
 
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """From points to the segment [m]."""
@@ -96,7 +106,7 @@ class Arc(Attachment):
     radius: float = number(unit="m", above=0)
     start_deg: float = number(unit="degrees", at_least=-360, at_most=360)
     end_deg: float = number(unit="degrees", at_least=-360, at_most=720)
-    width: float = number(unit="m", above=0)
+    width: float = number(unit="m", above=0, at_most=1)
 
     def __post_init__(self) -> None:
         """Check the angles."""
@@ -123,8 +133,8 @@ class Disc(Attachment):
     """A filled disc; a width reaches beyond its rim."""
 
     centre: tuple[float, float] = vector(length=2, unit="m")
-    radius: float = number(unit="m", above=0)
-    width: float = number(0.0, unit="m", at_least=0)
+    radius: float = number(unit="m", above=0, at_most=1)
+    width: float = number(0.0, unit="m", at_least=0, at_most=1)
 
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """From points to the disc [m]; 0 inside."""
@@ -136,7 +146,15 @@ class Polygon(Attachment):
     """A filled simple polygon; a width reaches beyond its outline."""
 
     points: tuple[tuple[float, float], ...] = points(at_least=3)
-    width: float = number(0.0, unit="m", at_least=0)
+    width: float = number(0.0, unit="m", at_least=0, at_most=1)
+
+    def __post_init__(self) -> None:
+        """Check that the outline does not cross itself."""
+        super().__post_init__()
+        sides = list(zip(self.points, (*self.points[1:], self.points[0]), strict=True))
+        for i, j in combinations(range(len(sides)), 2):
+            if _cross(*sides[i], *sides[j]):
+                raise SceneError(f"attachments.points: the sides after point {i} and point {j} cross; reorder them.")
 
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """From points to the polygon [m]; 0 inside, by the even-odd rule."""

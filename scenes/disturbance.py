@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
+import numpy as np
 from jiggle_mj.scenes.section import Section, number
+
+from jiggle_mj.errors import SceneError
 
 if TYPE_CHECKING:
     from jiggle_mj.scenes.observer import Observer
@@ -24,6 +27,13 @@ class Disturbance(Section):
     magnitude: float
     start: float = number(0.0, unit="s", at_least=0, at_most=1e6)
     """When it begins; at 0 it is there before the sheet first comes to rest."""
+
+    def check(self, size: tuple[float, float]) -> None:  # most act everywhere
+        """Refuse what would miss a sheet of this size [m].
+
+        Raises:
+            SceneError: it lies beside the sheet.
+        """
 
 
 class TissueDisturbance(Disturbance, ABC):
@@ -46,3 +56,17 @@ class SensingDisturbance(Disturbance, ABC):
     @abstractmethod
     def begin(self, observer: "Observer") -> None:
         """Change what is seen or reported from now on."""
+
+
+def meet_sheet(size: tuple[float, float], place: tuple[float, float], radius: float, *, what: str) -> None:
+    """Refuse a spot that does not reach a sheet of this size.
+
+    Raises:
+        SceneError: it lies further off than its radius.
+    """
+    off = np.linalg.norm(np.maximum(np.abs(place) - np.array(size) / 2, 0))
+    if off > radius:
+        raise SceneError(
+            f"{what} = {list(place)}: {1e3 * off:.1f} mm off the sheet, which reaches to +-{size[0] / 2:g} m and "
+            f"+-{size[1] / 2:g} m; the radius is {1e3 * radius:.1f} mm."
+        )

@@ -4,7 +4,8 @@ The names are those of the estimator's effects: what a scene calls `gravity` is 
 """
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import fields, replace
+from difflib import get_close_matches
 
 from jiggle_mj.scenes import anchor_disturbances as anchor
 from jiggle_mj.scenes import image_disturbances as image
@@ -70,9 +71,29 @@ def named(name: object) -> type[Disturbance]:
     Raises:
         SceneError: there is none; the message lists those there are.
     """
+    if name is None:
+        raise SceneError('a disturbance lacks its name; write name = "gravity", say.')
     if not isinstance(name, str) or name not in DISTURBANCES:
-        raise SceneError(f"no disturbance named {name!r}; there are {', '.join(DISTURBANCES)}.")
+        near = get_close_matches(str(name), DISTURBANCES, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ";"
+        raise SceneError(f"no disturbance named {name!r}{hint} There are {', '.join(DISTURBANCES)}.")
     return DISTURBANCES[name]
+
+
+def name_of(disturbance: Disturbance) -> str:
+    """What scene files call it."""
+    return next(name for name, cls in DISTURBANCES.items() if type(disturbance) is cls)
+
+
+def described(disturbance: Disturbance) -> str:
+    """Name, magnitude, and what else differs from the defaults: gravity=1 [start=3, tilt_deg=20]."""
+    others = [f for f in fields(disturbance) if f.name != "magnitude" and getattr(disturbance, f.name) != f.default]
+    more = ", ".join(f"{f.name}={_plain(getattr(disturbance, f.name))}" for f in others)
+    return f"{name_of(disturbance)}={disturbance.magnitude:g}" + (f" [{more}]" if more else "")
+
+
+def _plain(value: object) -> str:
+    return str(list(value)) if isinstance(value, tuple) else f"{value:g}"
 
 
 def disturbed(scene: Scene, texts: Iterable[str]) -> Scene:
@@ -86,6 +107,9 @@ def disturbed(scene: Scene, texts: Iterable[str]) -> Scene:
 
 def _read(text: str) -> Disturbance:
     name, equals, magnitude = text.partition("=")
+    base, dot, _ = name.partition(".")
+    if dot and base in DISTURBANCES:
+        raise SceneError(f"{text!r}: only the magnitude can be given here; other keys of {base} go into a scene file.")
     cls = named(name)
     try:
         return cls(**{"magnitude": float(magnitude)} if equals else {})

@@ -46,15 +46,18 @@ def with_highlights(
     v, u = np.mgrid[:height, :width]
     sight = np.stack([(u - (width - 1) / 2) / focal, (v - (height - 1) / 2) / focal, np.ones_like(depth)], axis=2)
     rotation, place = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    even = cv2.GaussianBlur(np.where(wet, depth, np.median(depth[wet]) if wet.any() else 1.0), (0, 0), SMOOTH)
+    share = cv2.GaussianBlur(wet.astype(float), (0, 0), SMOOTH)
+    even = np.where(wet, cv2.GaussianBlur(np.where(wet, depth, 0.0), (0, 0), SMOOTH) / np.maximum(share, 1e-3), 1.0)
+    inner = cv2.erode(wet.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     points = (sight * even[..., None]) @ rotation.T + place
     normal = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
     normal = _unit(normal * np.sign(normal[..., 2:]))
-    slope = _bumps()[tuple(np.floor(points[..., axis] / CELL).astype(int) % CELLS for axis in (1, 0))]
+    u, v = (np.mod(points[..., axis] / CELL, CELLS).astype(np.float32) for axis in (0, 1))
+    slope = cv2.remap(_bumps(), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     normal = _unit(normal - np.concatenate([slope, np.zeros((height, width, 1))], axis=2))
     halfway = _unit(_unit(-sight @ rotation.T) + towards_lamp)
     shine = strength * np.maximum((normal * halfway).sum(axis=2), 0.0) ** SHARPNESS
-    return np.clip(np.round(image + 255 * np.where(wet, shine, 0.0)[..., None]), 0, 255).astype(np.uint8)
+    return np.clip(np.round(image + 255 * np.where(inner, shine, 0.0)[..., None]), 0, 255).astype(np.uint8)
 
 
 def _unit(vectors: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:

@@ -22,6 +22,8 @@ SMOKE_RGB = np.array([205.0, 205.0, 210.0])
 BLOOD_RGB = np.array([58.0, 10.0, 12.0])
 SMOKE_GRID = 64
 """Pixels of the picture from which the smoke is enlarged."""
+SMOKE_DISPARITY = 1 / 16
+"""Of the image's width: about twice that of tissue in the default camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,10 +81,16 @@ class Haze(OfImages):
     """How much of the light it replaces on average."""
 
     def begin(self, observer: "Observer") -> None:
-        """Other clouds in each frame, and in each of the two images: they are close to the lens."""
+        """Other clouds in each frame, nearer to the cameras than the tissue, so further apart in the two images."""
 
         def hazed(pair: StereoPair, rng: np.random.Generator) -> StereoPair:
-            return _each(pair, lambda image: _smoky(image, self.magnitude, rng))
+            height, width = pair.left.shape[:2]
+            apart = round(width * SMOKE_DISPARITY)
+            clouds = cv2.resize(smooth_noise(rng, SMOKE_GRID, (SMOKE_GRID / 10,)), (width + apart, height))
+            return StereoPair(
+                left=_smoky(pair.left, self.magnitude, clouds[:, :width]),
+                right=_smoky(pair.right, self.magnitude, clouds[:, apart:]),
+            )
 
         observer.faults.images.append(hazed)
 
@@ -142,8 +150,6 @@ def _whole(levels: Float[np.ndarray, "..."]) -> np.ndarray:
     return np.clip(np.round(levels), 0, 255).astype(np.uint8)
 
 
-def _smoky(image: "Image", amount: float, rng: np.random.Generator) -> "Image":
-    height, width = image.shape[:2]
-    clouds = cv2.resize(smooth_noise(rng, SMOKE_GRID, (SMOKE_GRID / 10,)), (width, height))
+def _smoky(image: "Image", amount: float, clouds: Float[np.ndarray, "height width"]) -> "Image":
     share = np.clip(amount * (1 + 0.5 * clouds), 0, 1)[..., None]
     return _whole((1 - share) * image + share * SMOKE_RGB)

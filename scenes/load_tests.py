@@ -6,6 +6,7 @@ on the disc, and D times the biharmonic of the deflection is 1 (Timoshenko and W
 Shells, 1959, chapter 4); solved with the model's stiffness matrix, as stepping comes too slowly to so weak a rest.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -23,8 +24,8 @@ NUDGE = 1e-8
 """Displacement for the derivative of bending forces [m]."""
 DISC = 0.42
 """Radius of the disc over the shorter side."""
-FITTED = 0.8
-"""Share of the disc's radius within which a quartic is fitted to its deflection."""
+FITTED, ENOUGH = 0.8, 40
+"""Share of the disc's radius within which a quartic is fitted to its deflection, and to how many vertices at least."""
 RIGID = 1e4
 """Stiffness of what holds a vertex, over the membrane's."""
 STILL = 1e-7
@@ -50,7 +51,7 @@ class Stiffness:
     shear: float
     """Shear modulus times thickness [N/m]."""
     bending: float
-    """D [N m]."""
+    """D [N m]; NaN on a mesh too coarse to tell."""
 
 
 def typed(tissue: Tissue) -> Stiffness:
@@ -86,7 +87,7 @@ def far_from_declared(scene: Scene, found: tuple[Stiffness, ...]) -> list[str]:
     return [
         f"{name.replace('_', ' ')} is {ratio:.3g} times what [declared] says."
         for name, ratio in ratios.items()
-        if abs(ratio - 1) > TOLERATED
+        if abs(ratio - 1) > TOLERATED  # never of NaN
     ]
 
 
@@ -160,8 +161,10 @@ def _bending(scene: Scene) -> float:
     sheet, radius = simulation.tissue.sheet, DISC * min(scene.tissue.size)
     x, y = sheet.vertices.T / radius
     free = np.flatnonzero(np.hypot(x, y) < 1)
-    deflection = np.linalg.solve(upward_stiffness(simulation, free), sheet.vertex_areas()[free])
     fitted = np.hypot(x, y)[free] < FITTED
+    if fitted.sum() < ENOUGH:
+        return math.nan
+    deflection = np.linalg.solve(upward_stiffness(simulation, free), sheet.vertex_areas()[free])
     powers = [(i, j) for i in range(5) for j in range(5 - i)]
     quartic = np.column_stack([x[free][fitted] ** i * y[free][fitted] ** j for i, j in powers])
     found = dict(zip(powers, np.linalg.lstsq(quartic, deflection[fitted])[0], strict=True))

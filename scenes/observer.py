@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from jiggle_mj.scenes import sensing as sense
 from jiggle_mj.scenes.disturbance import SensingDisturbance
+from jiggle_mj.scenes.disturbances import name_of
 from jiggle_mj.scenes.history import History
 from jiggle_mj.scenes.simulation import Simulation
 from jiggle_mj.scenes.stereo import StereoRenderer, place_cameras, stereo_camera
@@ -82,9 +83,9 @@ class Observer:
         for place, one in enumerate(scene.disturbances):
             if isinstance(one, SensingDisturbance):
                 if one.needs and sensing not in one.needs:
+                    which = f"disturbances[{place}]" if scene.secret else f"the disturbance {name_of(one)}"
                     raise SceneError(
-                        f"disturbances[{place}] needs sensing = {' or '.join(map(repr, one.needs))}; this is "
-                        f"{sensing!r}."
+                        f"{which} needs sensing = {' or '.join(map(repr, one.needs))}; this is {sensing!r}."
                     )
                 self._coming.append(one)
         self._coming.sort(key=lambda one: one.start)

@@ -19,7 +19,7 @@ IMPORT_ERROR: Exception | None = None
 
 try:
     import mujoco
-except (AttributeError, ImportError, OSError) as error:
+except (AttributeError, ImportError, OSError, RuntimeError) as error:
     IMPORT_ERROR = error
     os.environ["MUJOCO_GL"] = "disabled"
     import mujoco  # noqa: F401
@@ -30,7 +30,9 @@ except (AttributeError, ImportError, OSError) as error:
 def no_opengl(error: Exception) -> str:
     """What to tell someone whose machine has no offscreen OpenGL, in one line."""
     if TOO_LATE:
-        return "No offscreen OpenGL: mujoco was imported before jiggle_mj. Import jiggle_mj first, or set MUJOCO_GL=egl."
+        return (
+            "No offscreen OpenGL: mujoco was imported before jiggle_mj. Import jiggle_mj first, or set MUJOCO_GL=egl."
+        )
     cause = error.__cause__ or error
     reason = (str(cause).splitlines() or [type(cause).__name__])[0].rstrip(".")
     return (

@@ -12,7 +12,7 @@ from typing import Self
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.scenes.disturbances import DISTURBANCES
+from jiggle_mj.scenes.disturbances import described
 from jiggle_mj.scenes.observer import SENSING, Observer, Sensing
 from jiggle_mj.scenes.procedure import carry_out
 from jiggle_mj.scenes.scene import Scene
@@ -27,6 +27,8 @@ from jiggle_mj.truth import Truth, TruthFrame
 
 CHANCE = (1,)
 """Sets the failures of cuts and sutures apart from the noise of sensing."""
+WIDEST, REACH = 0.05, 1.0
+"""Largest radius of the jaws, and how far from the middle of the sheet the tip may go along each axis [m]."""
 WAIT_STEPS = 5
 """Steps of a Wait before the tissue may be found at rest: still frames are a little more than 0.1 s apart."""
 
@@ -78,8 +80,7 @@ class Reference:
         """What a recording says of the scene: its disturbances, unless they are secret."""
         if self.scene.secret or not self.scene.disturbances:
             return {}
-        names = {cls: name for name, cls in DISTURBANCES.items()}
-        return {"disturbances": ", ".join(f"{names[type(one)]}={one.magnitude:g}" for one in self.scene.disturbances)}
+        return {"disturbances": ", ".join(map(described, self.scene.disturbances))}
 
     def step(self, action: Action) -> Observation:
         """Carry out an action, let the tissue settle, and observe; without images and points the frame was lost.
@@ -95,13 +96,15 @@ class Reference:
             case Release():
                 self._open()
             case Move():
-                self._move(_finite(action.to, name="Move.to"))
+                self._move(action)
             case Cut() | Suture():
                 result = carry_out(action, self._simulation, self._chance)
                 self._done.append({"index": self._index + 1} | result)
                 self._events = (*self._events, action)
             case Wait():
                 pass
+            case _:
+                raise ActionError(f"step takes a Grasp, Move, Release, Wait, Cut or Suture; got {action!r}.")
         settled = self._wait() if isinstance(action, Wait) else self._settle()
         seen = self._observer.look()
         if seen is None:
@@ -156,8 +159,8 @@ class Reference:
         if self._closed:
             raise ActionError(f"grasp at {_text(action.point)} while grasp {self._grasp} holds: release it first.")
         point = _finite(action.point, name="Grasp.point")
-        if not (math.isfinite(action.radius) and action.radius > 0):
-            raise ActionError(f"Grasp.radius must be above 0 m; got {action.radius}.")
+        if not 0 < action.radius <= WIDEST:
+            raise ActionError(f"Grasp.radius must be above 0 m and at most {WIDEST} m; got {action.radius}.")
         distance = np.linalg.norm(self._simulation.surface() - point, axis=1)
         inside = distance <= action.radius
         if not inside.any():
@@ -182,7 +185,14 @@ class Reference:
         self._simulation.jaws.open()
         self._closed = False
 
-    def _move(self, to: Float[np.ndarray, " 3"]) -> None:
+    def _move(self, action: Move) -> None:
+        to = _finite(action.to, name="Move.to")
+        lowest = 0.0 if self.scene.bed.present else -REACH
+        if np.abs(to).max() > REACH or to[2] < lowest:
+            raise ActionError(
+                f"Move.to = {_text(to)} m is out of reach: each coordinate must be within {REACH:g} m, and z at least "
+                f"{lowest:g} m. Lengths are in metres."
+            )
         start = self._simulation.jaws.tip
         n_steps = max(math.ceil(np.linalg.norm(to - start) / (self.scene.tweezer.speed * TIMESTEP)), 1)
         if not self._closed:

@@ -20,13 +20,13 @@ class ToolBias(SensingDisturbance):
     """The tip is not where the robot says."""
 
     magnitude: float = number(2e-3, unit="m", at_least=0, at_most=0.1)
-    direction: tuple[float, float, float] = vector((1.0, 0.0, 0.0), length=3)
+    direction: tuple[float, float, float] = vector((1.0, 0.0, 0.0), length=3, direction=True)
     """From the true to the reported tip, world; its length does not count."""
 
     def begin(self, observer: "Observer") -> None:
         """Move the report."""
         way = np.array(self.direction)
-        observer.faults.tool_offset = self.magnitude * way / max(float(np.linalg.norm(way)), 1e-12)
+        observer.faults.tool_offset = self.magnitude * way / np.linalg.norm(way)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,7 @@ Tissue coordinates are the world's x and y in metres, origin in the middle of th
 degrees and their names say so. Nothing here touches MuJoCo.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -14,13 +15,16 @@ from jiggle_mj.scenes.section import Section, choice, integer, number, points, s
 from jiggle_mj.errors import SceneError
 from jiggle_mj.observation import Declaration
 
+MOST = 20_000
+"""Vertices of a sheet."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Tissue(Section):
     """The sheet: a thin shell of St Venant-Kirchhoff material."""
 
     section: ClassVar[str] = "tissue"
-    size: tuple[float, float] = vector((0.1, 0.1), length=2, unit="m", above=0)
+    size: tuple[float, float] = vector((0.1, 0.1), length=2, unit="m", above=0, at_most=1)
     """Extent in x and y [m]."""
     thickness: float = number(1e-3, unit="m", above=0, at_most=0.02)
     young: float = number(30e3, unit="Pa", above=0, at_most=1e9)
@@ -204,6 +208,14 @@ class Scene:
                 f"tissue.spacing = {self.tissue.spacing}: must be at most a quarter of the shorter side, "
                 f"{min(self.tissue.size) / 4:g} m."
             )
+        n = self.tissue.size[0] * self.tissue.size[1] / (math.sqrt(0.75) * self.tissue.spacing**2)
+        if n > MOST:
+            raise SceneError(
+                f"tissue.spacing = {self.tissue.spacing} m on {self.tissue.size[0]:g} by {self.tissue.size[1]:g} m "
+                f"makes about {n:.3g} vertices; at most {MOST} are allowed. Raise spacing or make the sheet smaller."
+            )
+        for disturbance in self.disturbances:
+            disturbance.check(self.tissue.size)
         half = tuple(side / 2 for side in self.tissue.size)
         for x, y in self.programme.points:
             if abs(x) > half[0] or abs(y) > half[1]:

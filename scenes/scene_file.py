@@ -12,7 +12,7 @@ from typing import Any
 
 from jiggle_mj.scenes.attachments import SHAPES, Attachment
 from jiggle_mj.scenes.disturbance import Disturbance
-from jiggle_mj.scenes.disturbances import DISTURBANCES, named
+from jiggle_mj.scenes.disturbances import name_of, named
 from jiggle_mj.scenes.scene import (
     Bed,
     Camera,
@@ -126,8 +126,7 @@ def scene_table(scene: Scene) -> dict[str, Any]:
     table: dict[str, Any] = {"seed": scene.seed, "secret": scene.secret}
     shape_names = {cls: shape for shape, cls in SHAPES.items()}
     table["attachments"] = [{"shape": shape_names[type(shape)], **_plain(shape)} for shape in scene.attachments]
-    names = {cls: name for name, cls in DISTURBANCES.items()}
-    table["disturbances"] = [{"name": names[type(one)], **_plain(one)} for one in scene.disturbances]
+    table["disturbances"] = [{"name": name_of(one), **_plain(one)} for one in scene.disturbances]
     return table | {key: _plain(getattr(scene, key)) for key in SECTIONS}
 
 

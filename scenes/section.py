@@ -93,17 +93,23 @@ def choice(default: str | object = MISSING, *, among: tuple[str, ...]) -> Any:
 
 
 def vector(
-    default: tuple[float, ...] | object = MISSING, *, length: int, unit: str = "", above: float | None = None
+    default: tuple[float, ...] | object = MISSING,
+    *,
+    length: int,
+    unit: str = "",
+    above: float = -math.inf,
+    at_most: float = math.inf,
+    direction: bool = False,
 ) -> Any:
-    """A list of `length` finite numbers, each above a bound where one is given."""
-    bound = f" above {above:g}" if above is not None else ""
-    allowed = f"a list of {length} numbers{bound}{f' {unit}' if unit else ''}"
+    """A list of `length` finite numbers, each within bounds where they are given; not all 0 if it is a direction."""
+    bound = f" in {_interval(above, None, at_most, None)}" if math.isfinite(above) or math.isfinite(at_most) else ""
+    allowed = f"a list of {length} numbers{bound}{f' {unit}' if unit else ''}{', not all 0' if direction else ''}"
 
     def check(value: object) -> tuple[float, ...]:
         if not isinstance(value, list | tuple) or len(value) != length:
             raise ValueError(allowed)
         reals = tuple(_real(entry, allowed) for entry in value)
-        if above is not None and min(reals) <= above:
+        if min(reals) <= above or max(reals) > at_most or (direction and not any(reals)):
             raise ValueError(allowed)
         return reals
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from jiggle_mj.scenes.disturbance import TissueDisturbance
+from jiggle_mj.scenes.disturbance import TissueDisturbance, meet_sheet
 from jiggle_mj.scenes.elements import Elements
 from jiggle_mj.scenes.section import integer, number, vector
 
@@ -61,10 +61,15 @@ class Inclusion(TissueDisturbance):
     """Tissue coordinates."""
     radius: float = number(0.012, unit="m", above=0, at_most=1)
 
+    def check(self, size: tuple[float, float]) -> None:
+        """Refuse a spot off the sheet."""
+        meet_sheet(size, self.centre, self.radius, what="inclusion.centre")
+
     def begin(self, simulation: "Simulation") -> None:
-        """Of the elements whose middle lies in it."""
+        """Of the elements whose middle lies in it, or the nearest."""
         elements = Elements(simulation)
-        inside = np.linalg.norm(elements.centres - np.array(self.centre), axis=1) <= self.radius
+        distance = np.linalg.norm(elements.centres - np.array(self.centre), axis=1)
+        inside = (distance <= self.radius) | (distance == distance.min())
         elements.stiffness[inside] *= self.magnitude
 
 

@@ -109,6 +109,6 @@ class Simulation:
         np.savez(path, **state)
         raise SimulationError(
             f"the simulation became unstable at t = {data.time:.2f} s (largest coordinate {size:.3g} m, speed "
-            f"{speed:.3g} m/s); the state is in {path}. Lower tissue.young or the attachments' stiffness, or raise "
-            "tissue.damping."
+            f"{speed:.3g} m/s); the state is in {path}. Lower tissue.young, the attachments' stiffness "
+            "or the magnitude of what disturbs the tissue, or raise tissue.damping."
         )

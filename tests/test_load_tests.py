@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -74,6 +75,10 @@ def test_a_stiff_spot_makes_the_sheet_stiffer_but_not_as_stiff_as_itself():
 def test_a_mesh_that_would_be_too_coarse_is_left_out():
     rough = Scene(name="rough", tissue=Tissue(size=(0.06, 0.06), spacing=0.012))
     assert [one.spacing for one in load_tests(rough)] == pytest.approx([0.012, 0.009])
+
+
+def test_bending_is_not_told_on_a_mesh_too_coarse_for_it():
+    assert math.isnan(stiffness(on("equilateral", 0.02)).bending)
 
 
 def test_the_verb_says_where_the_declared_material_is_not_the_sheets(tmp_path, monkeypatch, capsys):

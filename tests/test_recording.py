@@ -643,6 +643,12 @@ def test_an_existing_recording_is_not_overwritten_unasked(tmp_path):
         write(tmp_path / "no" / "run.mcap", observations(1))
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux's device that is always full")
+def test_a_full_disk_is_said_in_one_line():
+    with pytest.raises(OutputError, match="/dev/full cannot be written on: No space left on device"):
+        write(Path("/dev/full"), observations(3), overwrite=True)
+
+
 def test_times_of_large_clocks_survive():
     """Timestamps are split into seconds and nanoseconds without rounding."""
     time = 1_700_000_000_123_456_789

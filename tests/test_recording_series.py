@@ -185,8 +185,8 @@ def test_more_of_a_series_leaves_what_is_there(scene, one_by_one, tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"sensing": "points"}, "is not seed 0 of this scene from points; it says: scene 'small', sensing 'particles'"),
-        ({"scene": "other"}, "is not seed 0 of this scene from particles; it says: scene 'small'"),
+        ({"sensing": "points"}, "'sensing': 'particles', 'seed': '0'}, not {'name': 'small', 'sensing': 'points'"),
+        ({"scene": "other"}, "is of a scene of that name with other contents or disturbances"),
         ({"damage": b""}, "is not an MCAP file"),
         ({"damage": 200}, "is truncated"),
     ],
@@ -460,6 +460,16 @@ def test_a_cluster_of_which_a_worker_is_killed_makes_the_same_recordings(one_by_
     assert killed[0].returncode == -signal.SIGKILL
     assert len(json.loads(capsys.readouterr().out)["recordings"]) == COUNT
     assert contents(out) == one_by_one
+
+
+def test_a_scheduler_without_workers_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("jiggle_mj.cluster.WORKERS_WITHIN", 1)
+    with (
+        dask_cluster(tmp_path, 0) as (url, _),
+        pytest.raises(ClusterError, match=rf"the scheduler at {url} has no workers. Start some"),
+        cluster(url),
+    ):
+        pass
 
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):

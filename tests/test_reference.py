@@ -1,6 +1,7 @@
 """The reference tissue: forces, grasps, determinism, and what it refuses. A small sheet keeps the tests quick."""
 
 import dataclasses
+import inspect
 import itertools
 import json
 import math
@@ -270,10 +271,25 @@ def test_a_second_grasp_and_an_idle_release_are_refused():
         reference.step(Grasp(point=-CORNER, radius=8e-3))
 
 
-@pytest.mark.parametrize("action", [Move(to=np.array([0.0, np.nan, 0.0])), Grasp(point=CORNER, radius=-1.0)])
+@pytest.mark.parametrize(
+    "action",
+    [
+        Move(to=np.array([0.0, np.nan, 0.0])),
+        Move(to=np.array([-25.0, -25.0, 20.0])),
+        Move(to=np.array([0.0, 0.0, -0.01])),
+        Grasp(point=CORNER, radius=-1.0),
+        Grasp(point=CORNER, radius=6.0),
+    ],
+)
 def test_actions_with_impossible_numbers_are_refused(action):
     with pytest.raises(ActionError, match="must be"):
         particles().step(action)
+
+
+@pytest.mark.parametrize("action", ["grasp", Wait, None])
+def test_what_is_no_action_is_refused(action):
+    with pytest.raises(ActionError, match="step takes a Grasp, Move, Release, Wait, Cut or Suture; got"):
+        inspect.unwrap(Reference.step)(particles(), action)
 
 
 def test_an_unstable_state_is_dumped_and_named(tmp_path):

@@ -197,11 +197,17 @@ def test_noise_blur_and_exposure():
     np.testing.assert_array_equal(still("blur=2").left, cv2.GaussianBlur(plain.left, (0, 0), 2))
 
 
-def test_smoke_replaces_a_share_of_the_light_otherwise_in_each_image():
+def test_smoke_replaces_a_share_of_the_light_and_is_nearer_than_the_tissue():
     plain, hazed = still(), still("haze=0.4")
     share = [(np.asarray(new, float) - old).mean() / (207 - old.mean()) for old, new in pairs(plain, hazed)]
     assert np.mean(share) == pytest.approx(0.4, abs=0.1)
-    assert np.abs(shift(hazed.left, hazed.right) - shift(plain.left, plain.right)).max() < 1
+    black = StereoPair(left=np.zeros_like(plain.left), right=np.zeros_like(plain.left))
+    with made("haze=0.4", sensing="stereo") as reference:
+        reference.step(Wait())
+        (smoke,) = reference._observer.faults.images
+    alone = smoke(black, np.random.default_rng(0))
+    apart = round(alone.left.shape[1] / 16)
+    np.testing.assert_array_equal(alone.left[:, apart:], alone.right[:, :-apart])
 
 
 def pairs(one: StereoPair, other: StereoPair) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -249,7 +255,7 @@ def test_blood_hides_its_share_of_the_sheet():
 @pytest.mark.parametrize(("name", "needs"), NEEDS.items())
 def test_sensing_that_has_nothing_to_disturb_is_refused(name, needs):
     for sensing in {"particles", "cloud"} - set(needs):
-        with pytest.raises(SceneError, match=r"disturbances\[0\] needs sensing = "):
+        with pytest.raises(SceneError, match=rf"the disturbance {name} needs sensing = "):
             made(name, sensing=sensing)
 
 
