@@ -38,7 +38,7 @@ def outside(tip: Float[Array, " 3"]) -> Float[Array, ""]:
 
 
 def log_shrinkage(slope: Float[Array, "n m 3"], covariance: Float[Array, "n n"], sd: float) -> Float[Array, ""]:
-    """ln |I - K J| of an update with white noise of that deviation [m]: twice what the entropy falls by [nat], negative.
+    """Logarithm of |I - K J| for white noise of that deviation [m]: minus twice what the entropy falls by [nat].
 
     The paper minimises the determinant itself, which for hundreds of particles is 0 in any precision. By Sylvester's
     identity ln |I - K J| = -ln |I + L^T J^T J L / sd^2| with Sigma = L L^T.
