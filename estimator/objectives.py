@@ -37,7 +37,7 @@ def outside(tip: Float[Array, " 3"]) -> Float[Array, ""]:
     return jnp.maximum(workspace(tip) - 1.0, 0.0)
 
 
-def log_shrinkage(slope: Float[Array, "n m 3"], covariance: Float[Array, "n n"], sd: float) -> Float[Array, ""]:
+def log_shrinkage(slope: Float[Array, "n m 3"], covariance: Float[Array, "n n"], sd: float | Array) -> Float[Array, ""]:
     """Logarithm of |I - K J| for white noise of that deviation [m]: minus twice what the entropy falls by [nat].
 
     The paper minimises the determinant itself, which for hundreds of particles is 0 in any precision. By Sylvester's
