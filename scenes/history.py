@@ -22,6 +22,11 @@ class History:
         """Keep the present state."""
         self._states.append((self._data.qpos.copy(), self._data.mocap_pos.copy()))
 
+    def tool_stood(self) -> None:
+        """Say that the tool has been where it is for as long as anybody remembers."""
+        for k, (qpos, _) in enumerate(self._states):
+            self._states[k] = (qpos, self._data.mocap_pos.copy())
+
     def before(self, delay: float) -> mujoco.MjData:
         """The state of a while ago [s], or the oldest there is; it is overwritten by the next call."""
         steps = round(delay / self._model.opt.timestep)

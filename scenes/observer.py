@@ -113,8 +113,10 @@ class Observer:
             self._renderer.gloss = strength
 
     def jaws_closed(self) -> None:
-        """Note where the tool is, from where its way is counted."""
+        """Note where the tool is, from where its way is counted; it came there some time before it closed."""
         self._closed_at = self.simulation.jaws.tip
+        if self._history is not None:
+            self._history.tool_stood()
 
     def tip(self) -> Float[np.ndarray, " 3"]:
         """Where the robot says that the tip is [m]."""

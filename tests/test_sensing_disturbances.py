@@ -103,6 +103,13 @@ def test_late_senses_show_where_things_were():
     assert np.abs(tips[-1] - tips[-1 - STEPS]).max() > 1e-3
 
 
+def test_a_late_tool_is_where_it_closes():
+    """It came there before; a jump from where it was parked would be a grasp off the tissue."""
+    reference = made("tool_latency=1")
+    reference.step(Wait())
+    np.testing.assert_array_equal(reference.step(Grasp(point=CORNER, radius=9e-3)).tool.position, CORNER)
+
+
 def lift_points(reference: Reference) -> np.ndarray:
     """Where the tracked points of the present state are."""
     import mujoco
