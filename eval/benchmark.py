@@ -21,12 +21,15 @@ from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.controllers import Scales, Situation, displacement_loss, large_step
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
 from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
+from jiggle_mj.estimator.filters.shots import simulator
 from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.objectives import uncertainty_weighted_displacement
 from jiggle_mj.estimator.surrogate import surrogate
 
 from jiggle_mj.observation import Declaration
@@ -117,12 +120,12 @@ def case(n: int) -> Case:
     )
 
 
-def benchmark(sizes: tuple[int, ...], *, explicit: bool, say: Callable[[str], None]) -> Metrics:
-    """Times of the update and the equilibrium at each size, and of the paper's filter at the first.
+def benchmark(sizes: tuple[int, ...], *, paper: bool, say: Callable[[str], None]) -> Metrics:
+    """Times of the update, the equilibrium and an action of SL-D at each size, and of the paper's filter at the first.
 
     Args:
         sizes: particles, about; beyond `LARGEST` of the equilibrium alone.
-        explicit: measure the paper's filter too, which takes minutes on a CPU.
+        paper: measure the paper's filter and controller too, which takes minutes on a CPU.
         say: told what comes next.
     """
     metrics: Metrics = {"device": {"value": jax.devices()[0].device_kind, "unit": "name"}}
@@ -140,10 +143,14 @@ def benchmark(sizes: tuple[int, ...], *, explicit: bool, say: Callable[[str], No
             metrics[f"update_n{n}_compile_s"] = {"value": compiled, "unit": "s"}
             if n == sizes[0]:
                 metrics["found_share"] = {"value": _found_share(one), "unit": "share"}
-            if explicit and n == sizes[0]:
+            if paper:
+                say(f"n = {n}, the paper's controller")
+                _, planned = timed(_sl_d(one), repeats=3)
+                metrics[f"plan_sl_d_n{n}_s"] = {"value": planned, "unit": "s"}
+            if paper and n == sizes[0]:
                 say(f"n = {n}, the paper's filter")
-                paper = build_filter(one.mesh, one.declaration, EstimatorConfig(filter="explicit"))
-                _, slow = timed(partial(_last_frame, *paper, one), repeats=3)
+                explicit = build_filter(one.mesh, one.declaration, EstimatorConfig(filter="explicit"))
+                _, slow = timed(partial(_last_frame, *explicit, one), repeats=3)
                 metrics[f"update_explicit_n{n}_s"] = {"value": slow, "unit": "s"}
                 metrics["update_explicit_over_implicit"] = {"value": slow / seconds, "unit": "ratio"}
     for part in ("equilibrium", "update"):
@@ -199,6 +206,34 @@ def _equilibrium(one: Case) -> Callable[[], object]:
     tolerance = EstimatorConfig().force_sd * one.declaration.membrane_stiffness * one.mesh.spacing / 4
     search = eqx.filter_jit(equilibrium)
     return lambda: search(one.gripped, one.b, one.before, force_tolerance=tolerance).x
+
+
+def _sl_d(one: Case) -> Callable[[], object]:
+    """The search for one action, before the last frame, with a belief that is still the prior."""
+    pull, held = one.frames[-1].pull, one.frames[-1].held
+    assert pull is not None
+    f, covariance = simulator(one.mesh, one.declaration), 0.1 * STIFFNESS**2 * jnp.eye(one.mesh.n)
+    lifted = f.rest + jnp.array([[0.0, 0.0, 0.01]])
+    scales = Scales(
+        displacement=uncertainty_weighted_displacement(lifted, f.rest, covariance),
+        energy=jnp.asarray(1e-6),
+        noise=jnp.asarray(NOISE),
+    )
+    situation = Situation(
+        x=pull.before,
+        tip=pull.tip,
+        length=pull.length,
+        stiffness=jnp.where(held, EstimatorConfig().grip_stiffness * one.declaration.membrane_stiffness, 0.0),
+        b=one.b,
+        covariance=covariance,
+    )
+    low, high = jnp.min(f.rest, axis=0), jnp.max(f.rest, axis=0) + jnp.array([0.0, 0.0, LIFT])
+
+    @eqx.filter_jit
+    def search(f, situation, scales, key):
+        return large_step(displacement_loss(f, situation, scales), low, high, key)
+
+    return lambda: search(f, situation, scales, jax.random.key(0))
 
 
 def _last_frame(filter: Filter, prior: BoundaryBelief | AttachmentBelief, one: Case) -> object:

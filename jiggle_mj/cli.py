@@ -364,7 +364,7 @@ def bench(
 
         metrics = reference.reference_benchmark(sizes or reference.SIZES, say=say)
     else:
-        metrics = benchmark(sizes or SIZES, explicit=True, say=say)
+        metrics = benchmark(sizes or SIZES, paper=True, say=say)
     table = Table("", "figure", "", box=None)
     for name, entry in metrics.items():
         value = entry["value"]
