@@ -143,22 +143,22 @@ def benchmark(sizes: tuple[int, ...], *, paper: bool, say: Callable[[str], None]
             metrics[f"update_n{n}_compile_s"] = {"value": compiled, "unit": "s"}
             if n == sizes[0]:
                 metrics["found_share"] = {"value": _found_share(one), "unit": "share"}
-            if paper:
-                say(f"n = {n}, the paper's controller")
-                _, planned = timed(_sl_d(one), repeats=3)
-                metrics[f"plan_sl_d_n{n}_s"] = {"value": planned, "unit": "s"}
             if paper and n == sizes[0]:
                 say(f"n = {n}, the paper's filter")
                 explicit = build_filter(one.mesh, one.declaration, EstimatorConfig(filter="explicit"))
                 _, slow = timed(partial(_last_frame, *explicit, one), repeats=3)
                 metrics[f"update_explicit_n{n}_s"] = {"value": slow, "unit": "s"}
                 metrics["update_explicit_over_implicit"] = {"value": slow / seconds, "unit": "ratio"}
-    for part in ("equilibrium", "update"):
+        metrics["peak_memory"] = {"value": peak_memory(), "unit": "GiB"}
+        for n in [n for n in sizes if n <= LARGEST] if paper else []:
+            say(f"n = {n}, the paper's controller")
+            _, seconds = timed(_sl_d(case(n)), repeats=3)
+            metrics[f"plan_sl_d_n{n}_s"] = {"value": seconds, "unit": "s"}
+    for part in ("equilibrium", "update", "plan_sl_d"):
         times = {n: float(metrics[f"{part}_n{n}_s"]["value"]) for n in sizes if f"{part}_n{n}_s" in metrics}
         if len(times) > 1:
             slope = np.polyfit(np.log(list(times)), np.log(list(times.values())), 1)[0]
             metrics[f"{part}_exponent"] = {"value": float(slope), "unit": "exponent of n"}
-    metrics["peak_memory"] = {"value": peak_memory(), "unit": "GiB"}
     return metrics
 
 
