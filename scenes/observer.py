@@ -148,10 +148,10 @@ class Observer:
             self._renderer = None
 
     def _rig(self) -> Float[np.ndarray, "4 4"]:
-        """True pose of the left camera in the world."""
+        """True pose of the left camera in the world when it saw what is shown."""
         T = self.camera.T_world_camera
         for moved in self.faults.rig:
-            T = T @ moved(self.simulation.data.time)
+            T = T @ moved(self.simulation.data.time - self.faults.image_delay)
         return T
 
     def _images(self, data: mujoco.MjData) -> StereoPair | None:

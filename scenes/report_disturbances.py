@@ -119,7 +119,7 @@ class CameraDrift(SensingDisturbance):
         """Let the pair move from now on."""
 
         def moved(time: float) -> Float[np.ndarray, "4 4"]:
-            age = time - self.start
+            age = max(time - self.start, 0.0)
             return _pose(_sideways(self.magnitude * age, self.azimuth_deg), turn_deg=(0.0, 0.0, self.roll_deg * age))
 
         observer.faults.rig.append(moved)

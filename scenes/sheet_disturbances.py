@@ -80,7 +80,7 @@ class Heterogeneity(TissueDisturbance):
     magnitude: float = number(0.5, at_least=0, at_most=3)
     """Standard deviation of the stiffness's logarithm."""
     length: float = number(0.02, unit="m", above=0, at_most=1)
-    """Wavelengths are about six times this."""
+    """Wavelengths are about five times this."""
     seed: int = integer(0, at_least=0, at_most=2**32 - 1)
     """Draws the field."""
 
@@ -138,12 +138,15 @@ class StrainStiffening(TissueDisturbance):
     """Stiffness rises by this times the squared strain."""
 
     def begin(self, simulation: "Simulation") -> None:
-        """Set each element's stiffness by its own strain, step after step."""
+        """Scale each element's stiffness by its own strain, step after step, whatever else changes it."""
         elements = Elements(simulation)
-        soft = elements.stiffness.copy()
+        before = np.ones(len(elements.stiffness))
 
         def stiffen() -> None:
-            elements.stiffness[:] = soft * (1 + self.magnitude * elements.squared_strain())[:, None]
+            nonlocal before
+            now = 1 + self.magnitude * elements.squared_strain()
+            elements.stiffness[:] *= (now / before)[:, None]
+            before = now
 
         simulation.rules.append(stiffen)
 

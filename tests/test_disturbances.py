@@ -14,7 +14,7 @@ from jiggle_mj.scenes.scene_file import scene_from_table
 from jiggle_mj.scenes.simulation import Simulation
 
 from jiggle_mj.errors import SceneError
-from jiggle_mj.observation import Grasp, Move, Wait
+from jiggle_mj.observation import Grasp, Move, Release, Wait
 from jiggle_mj.truth import TruthFrame
 
 SCENE = Scene(
@@ -146,6 +146,30 @@ def test_broken_attachments_are_gone_and_carry_nothing():
     assert 0 < gone.sum() < (lifted()[1].stiffness > 0).sum()
     assert not frame.load[gone].any()
     assert frame.load.max() <= 0.01
+
+
+def test_what_slips_is_lost_and_what_is_left_pulls_no_harder():
+    limit, point = 0.02, np.array([*CORNER, 4e-4])
+    reference = Reference(disturbed(SCENE, [f"grasp_slip={limit}"]), seed=0, sensing="particles")
+    reference.step(Grasp(point=point, radius=9e-3))
+    held = reference.held
+    for height in (0.01, 0.02, 0.03):
+        reference.step(Move(to=point + np.array([0.0, 0.0, height])))
+    assert reference.held.sum() < held.sum() and not (reference.held & ~held).any()
+    assert reference._simulation.jaws.force().max() <= limit
+    reference.step(Release())
+    reference.step(Wait())
+    place = reference.truth_frame().positions
+    reference.step(Grasp(point=place[np.argmin(place[:, 0] + place[:, 1])], radius=9e-3))
+    assert reference.held.any()
+
+
+def test_what_begins_later_is_not_undone_by_strain_stiffening():
+    """Twice the stiffness, from 0.5 s on, of a sheet that has stiffened since the beginning."""
+    late = [{"name": "strain_stiffening", "magnitude": 400.0}, {"name": "stretch", "magnitude": 2.0, "start": 0.5}]
+    both = lifted(scene=dataclasses.replace(SCENE, disturbances=_read({"disturbances": late})))[1]
+    assert rms(both, lifted("strain_stiffening=400")[1]) > 0.3
+    assert rms(both, lifted("strain_stiffening=400", "stretch=2")[1]) < 0.1
 
 
 def test_a_disturbance_waits_for_its_start():
