@@ -12,6 +12,7 @@ from jiggle_mj.scenes.load_tests import hold
 from jiggle_mj.scenes.scene import Bed, Scene, Tissue
 from jiggle_mj.scenes.scene_file import scene_from_table
 from jiggle_mj.scenes.simulation import Simulation
+from jiggle_mj.scenes.tissue import CONTACT_SOLIMP, CONTACT_SOLREF
 
 from jiggle_mj.errors import SceneError
 from jiggle_mj.observation import Grasp, Move, Release, Wait
@@ -138,6 +139,29 @@ def test_strain_stiffening_multiplies_the_force_by_what_it_says(stretch):
         pull = springs.stiffness * (springs.anchor - simulation.anchors.moved)[:, 0]
         forces.append(sheet.vertices[:, 0] @ pull)
     assert forces[1] / forces[0] == pytest.approx(1 + 400 * (stretch + stretch**2 / 2) ** 2, rel=1e-3)
+
+
+def test_tilted_weight_pulls_to_where_it_is_said_to():
+    """A sheet on springs of 1 N/m alone is moved by its weight over their number, along gravity."""
+    held = (Disc(centre=(0.0, 0.0), radius=0.1, stiffness=1.0),)
+    tilted = _read({"disturbances": [{"name": "gravity", "magnitude": 0.5, "tilt_deg": 30.0, "azimuth_deg": 60.0}]})
+    simulation = Simulation(dataclasses.replace(WEIGHTLESS, attachments=held, disturbances=tilted), drawn=False)
+    tissue, moved = WEIGHTLESS.tissue, simulation.anchors.moved
+    weight = 0.5 * 9.81 * tissue.density * tissue.thickness * tissue.size[0] * tissue.size[1]
+    way = [np.sin(np.pi / 6) * np.cos(np.pi / 3), np.sin(np.pi / 6) * np.sin(np.pi / 3), -np.cos(np.pi / 6)]
+    np.testing.assert_allclose(moved.sum(axis=0), weight * np.array(way), rtol=1e-3)
+
+
+@pytest.mark.parametrize("softness", [100.0, 1000.0])
+def test_a_sheet_sinks_into_a_soft_bed_by_its_weight_over_the_contacts_stiffness(softness):
+    """Of a vertex of mass m: m times the stiffness in MuJoCo's direct form times d / (1 - d), d the impedance."""
+    table = {"disturbances": [{"name": "bed", "magnitude": 0.0, "softness": softness}]}
+    scene = Scene(name="soft", tissue=WEIGHTLESS.tissue, disturbances=_read(table))
+    simulation = Simulation(scene, drawn=False)
+    simulation.settle(speed=1e-8)
+    (hard, _), (_, impedance, *_) = CONTACT_SOLREF, CONTACT_SOLIMP
+    depth = 9.81 * softness / -hard * (1 - impedance) / impedance
+    assert -simulation.anchors.moved[:, 2].mean() == pytest.approx(depth, rel=0.01)
 
 
 def test_broken_attachments_are_gone_and_carry_nothing():
