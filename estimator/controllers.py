@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 from jiggle_mj.estimator.environment import Grip
-from jiggle_mj.estimator.filters.shots import SWEEPS
+from jiggle_mj.estimator.filters.shots import SWEEPS, slopes
 from jiggle_mj.estimator.objectives import (
     boundary_energy,
     log_shrinkage,
@@ -34,8 +34,6 @@ ALPHA = 2e-4
 """Of the descent [m^2]: a loss that changes by 1 over 1 cm moves the tip by 2 cm."""
 SAMPLES, ITERATIONS, KEPT = 100, 5, 0.1
 """Of SL-D, and the share of the best samples that the next action begins with."""
-AT_ONCE = 100
-"""Columns of the Jacobian that are computed together, which bounds the memory."""
 
 Loss = Callable[[Float[Array, " 3"]], Float[Array, ""]]
 
@@ -81,14 +79,13 @@ def displacement_loss(simulator: XPBD, situation: Situation, scales: Scales) -> 
 
 def entropy_loss(simulator: XPBD, situation: Situation, scales: Scales) -> Loss:
     """L_H of a tip; n times as much work as L_D."""
-    columns = jnp.eye(len(situation.b), dtype=situation.b.dtype)
 
     def loss(tip: Float[Array, " 3"]) -> Float[Array, ""]:
         def f(b: Float[Array, " n"]) -> Float[Array, "n 3"]:
             return ahead(simulator, situation, tip, b)
 
-        slope = jax.lax.map(lambda d: jax.jvp(f, (situation.b,), (d,))[1], columns, batch_size=AT_ONCE)
-        worth = log_shrinkage(slope, situation.covariance, scales.noise) / len(columns)
+        slope = slopes(f, situation.b)
+        worth = log_shrinkage(slope, situation.covariance, scales.noise) / len(slope)
         return _risk(simulator, situation, scales, tip, f(situation.b)) + worth
 
     return loss

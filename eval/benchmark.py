@@ -130,9 +130,10 @@ def benchmark(sizes: tuple[int, ...], *, paper: bool, say: Callable[[str], None]
     """
     metrics: Metrics = {"device": {"value": jax.devices()[0].device_kind, "unit": "name"}}
     with jax.enable_x64(True), one_thread():
+        cases = {}
         for n in sizes:
             say(f"n = {n}")
-            one = case(n)
+            cases[n] = one = case(n)
             compiled, seconds = timed(_equilibrium(one))
             metrics[f"equilibrium_n{n}_s"] = {"value": seconds, "unit": "s"}
             if n > LARGEST:
@@ -152,14 +153,20 @@ def benchmark(sizes: tuple[int, ...], *, paper: bool, say: Callable[[str], None]
         metrics["peak_memory"] = {"value": peak_memory(), "unit": "GiB"}
         for n in [n for n in sizes if n <= LARGEST] if paper else []:
             say(f"n = {n}, the paper's controller")
-            _, seconds = timed(_sl_d(case(n)), repeats=3)
+            _, seconds = timed(_sl_d(cases[n]), repeats=3)
             metrics[f"plan_sl_d_n{n}_s"] = {"value": seconds, "unit": "s"}
     for part in ("equilibrium", "update", "plan_sl_d"):
         times = {n: float(metrics[f"{part}_n{n}_s"]["value"]) for n in sizes if f"{part}_n{n}_s" in metrics}
-        if len(times) > 1:
-            slope = np.polyfit(np.log(list(times)), np.log(list(times.values())), 1)[0]
-            metrics[f"{part}_exponent"] = {"value": float(slope), "unit": "exponent of n"}
+        metrics |= growth(part, times)
     return metrics
+
+
+def growth(part: str, times: dict[int, float]) -> Metrics:
+    """The exponent with which seconds grow with n, by least squares; nothing of a single size."""
+    if len(times) < 2:
+        return {}
+    slope = np.polyfit(np.log(list(times)), np.log(list(times.values())), 1)[0]
+    return {f"{part}_exponent": {"value": float(slope), "unit": "exponent of n"}}
 
 
 def peak_memory() -> float:

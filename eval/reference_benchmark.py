@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from jiggle_mj.eval.benchmark import Metrics
+from jiggle_mj.eval.benchmark import Metrics, growth
 from jiggle_mj.scenes import Reference, Scene, load_scene, programme
 from jiggle_mj.scenes.tissue import TIMESTEP
 
@@ -35,9 +35,7 @@ def reference_benchmark(sizes: tuple[int, ...], *, say: Callable[[str], None]) -
         increments[n], steps = increment(sized(n))
         metrics[f"reference_increment_n{n}_s"] = {"value": increments[n], "unit": "s"}
         metrics[f"reference_increment_n{n}_steps"] = {"value": steps, "unit": "steps of 20 ms"}
-    if len(sizes) > 1:
-        slope = np.polyfit(np.log(list(increments)), np.log(list(increments.values())), 1)[0]
-        metrics["reference_increment_exponent"] = {"value": float(slope), "unit": "exponent of n"}
+    metrics |= growth("reference_increment", increments)
     if NAMED in increments:
         metrics["reference_increment_s"] = {"value": increments[NAMED], "unit": "s"}
     say("stereo pairs")

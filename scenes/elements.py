@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
+from jiggle_mj.scenes.mesh import triangle_areas
 
 if TYPE_CHECKING:
     from jiggle_mj.scenes.simulation import Simulation
@@ -24,8 +25,7 @@ class Elements:
         corners = place[model.flex_elem.reshape(-1, 3)]
         self.centres: Float[np.ndarray, "f 2"] = corners.mean(axis=1)
         """Tissue coordinates [m]."""
-        (ux, uy), (vx, vy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
-        self.areas: Float[np.ndarray, " f"] = 0.5 * np.abs(ux * vy - uy * vx)
+        self.areas: Float[np.ndarray, " f"] = np.abs(triangle_areas(place, model.flex_elem.reshape(-1, 3)))
         """[m^2]."""
         self.stiffness: Float[np.ndarray, "f 21"] = model.flex_stiffness.reshape(len(corners), -1)
         """K [N/m^3]."""

@@ -23,7 +23,6 @@ from jiggle_mj.observation import MeasuredPoints, StereoPair
 
 Sensing = Literal["stereo", "points", "particles", "cloud"]
 SENSING: tuple[Sensing, ...] = get_args(Sensing)
-TRACKED: tuple[Sensing, ...] = ("points", "particles")
 Image = UInt8[np.ndarray, "height width 3"]
 View = tuple[StereoPair | None, MeasuredPoints | None]
 """Images, measured points."""

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 from jiggle_mj.scenes import Reference, disturbed, load_scene, programme
-from tiny_scene import call
+from tiny_scene import call, scene_file
 
 from jiggle_mj.cluster import cluster
 from jiggle_mj.episode import observe
@@ -51,9 +51,7 @@ def scene(tmp_path_factory):
 
 
 def write_scene(folder: Path) -> Path:
-    path = folder / "small.toml"
-    path.write_text(SCENE)
-    return path
+    return scene_file(folder, name="small", text=SCENE)
 
 
 @pytest.fixture(scope="module")

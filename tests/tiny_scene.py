@@ -29,9 +29,9 @@ increments = 3
 """
 
 
-def scene_file(folder: Path) -> Path:
-    path = folder / "tiny.toml"
-    path.write_text(SCENE)
+def scene_file(folder: Path, *, name: str = "tiny", text: str = SCENE) -> Path:
+    path = folder / f"{name}.toml"
+    path.write_text(text)
     return path
 
 

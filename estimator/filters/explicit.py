@@ -26,7 +26,7 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
-from jiggle_mj.estimator.filters.shots import SWEEPS, History, Shots, predicted, simulator
+from jiggle_mj.estimator.filters.shots import SWEEPS, History, Shots, predicted, simulator, slopes
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.xpbd import XPBD
 
@@ -34,8 +34,6 @@ from jiggle_mj.observation import Declaration
 
 PRIOR_MEAN = 1e-4
 """The paper's mu_0 [N/m]."""
-AT_ONCE = 100
-"""Columns of the Jacobian that are computed together, which bounds the memory."""
 
 
 class MultipleShooting(Filter):
@@ -86,13 +84,13 @@ def update(
 
     `b` is where f is linearised [N/m].
     """
-    ahead, columns = belief.mean() - b, jnp.eye(len(b), dtype=b.dtype)
+    ahead = belief.mean() - b
 
     def one(shot: Shots):
         def f(b):
             return predicted(simulator, shot, b, sweeps=sweeps)
 
-        slope = jax.lax.map(lambda d: jax.jvp(f, (b,), (d,))[1], columns, batch_size=AT_ONCE)
+        slope = slopes(f, b)
         weighted = jnp.einsum("ani,nij->anj", slope, shot.precision)
         innovation = shot.end - f(b) - jnp.einsum("ani,a->ni", slope, ahead)
         squared = jnp.einsum("ni,nij,nj->", innovation, shot.precision, innovation)

@@ -4,6 +4,8 @@ A sample is one step of the tool: the state before, the tip, and what was observ
 latest step and k - 1 others, drawn uniformly from those since t_c, the last cut or suture.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,8 @@ from jiggle_mj.observation import Declaration
 
 HINGE = 1 / 30
 """Stiffness of the springs across hinges [membrane stiffness]."""
+AT_ONCE = 100
+"""Columns of the Jacobian that are computed together, which bounds the memory."""
 TIME_STEP, SWEEPS = 0.02, 20
 """Of f [s], and Gauss-Seidel sweeps."""
 
@@ -86,6 +90,12 @@ def predicted(simulator: XPBD, shot: Shots, b: Float[Array, " n"], *, sweeps: in
     """f(x_m, u_m, b) of one sample, whose arrays lack the leading axis."""
     grip = Grip.of(shot.tip, shot.length, shot.stiffness)
     return simulator.step(shot.start, b, grip, sweeps=sweeps)
+
+
+def slopes(f: Callable[[Float[Array, " n"]], Float[Array, "n 3"]], b: Float[Array, " n"]) -> Float[Array, "n n 3"]:
+    """J^T of a prediction: row i is how the state moves with b_i [m^2/N]."""
+    columns = jnp.eye(len(b), dtype=b.dtype)
+    return jax.lax.map(lambda d: jax.jvp(f, (b,), (d,))[1], columns, batch_size=AT_ONCE)
 
 
 def draw_samples(latest: int, k: int, rng: np.random.Generator) -> Int[np.ndarray, " _k"]:
