@@ -66,6 +66,61 @@ class AttachmentBelief(eqx.Module):
             lambda belief: (belief.precision, belief.shift), self, (self.precision + precision, self.shift + shift)
         )
 
+    def changed(self, region: Bool[Array, " n"], probability: Float[Array, " n"]) -> "AttachmentBelief":
+        """After something was done to the attachments of a region: what was seen of them says nothing of them now.
+
+        Their old s is integrated out, so that what was seen of the others stays; see `AttachmentPrior.parted` for what
+        neighbours say.
+
+        Args:
+            region: the particles.
+            probability: P(attached) of each from now on; used in the region alone.
+        """
+        held = jnp.where(region[:, None] & region[None], self.precision + jnp.diag(self.site_precision), 0.0)
+        factor = (jnp.linalg.cholesky(held + jnp.diag(jnp.where(region, 0.0, 1.0))), True)
+        across = jnp.where(region[:, None] & ~region[None], self.precision, 0.0)
+        told = jnp.where(region, self.shift + self.site_shift, 0.0)
+        both = ~region[:, None] & ~region[None]
+        prior, message = self.prior.parted(region, probability, self.message)
+        return eqx.tree_at(
+            lambda one: (one.prior, one.precision, one.shift, one.site_precision, one.site_shift, one.message),
+            self,
+            (
+                prior,
+                jnp.where(both, self.precision, 0.0) - across.T @ cho_solve(factor, across),
+                jnp.where(region, 0.0, self.shift - across.T @ cho_solve(factor, told)),
+                jnp.where(region, SITE_PRECISION[0], self.site_precision),
+                jnp.where(region, 0.0, self.site_shift),
+                message,
+            ),
+        )
+
+    def evidence_for(self, precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> Float[Array, ""]:
+        """Ln p(evidence) if s is distributed as believed, up to what does not depend on the belief.
+
+        Args:
+            precision: of independent evidence about s.
+            shift: its other half.
+        """
+        before = self.precision + jnp.diag(self.site_precision)
+        told = self.shift + self.site_shift
+        old, new = jnp.linalg.cholesky(before), jnp.linalg.cholesky(before + precision)
+        log_ratio = jnp.sum(jnp.log(jnp.diagonal(old))) - jnp.sum(jnp.log(jnp.diagonal(new)))
+        squared = (told + shift) @ cho_solve((new, True), told + shift) - told @ cho_solve((old, True), told)
+        return log_ratio + 0.5 * squared
+
+    def fixed(self, region: Bool[Array, " n"], mean: Float[Array, " n"], sd: Float[Array, " n"]) -> "AttachmentBelief":
+        """With nothing but this normal said of a region's s."""
+        free = self.changed(region, jnp.full(len(region), 0.5))
+        return eqx.tree_at(
+            lambda one: (one.site_precision, one.site_shift),
+            free,
+            (
+                jnp.where(region, sd**-2, free.site_precision),
+                jnp.where(region, mean * sd**-2, free.site_shift),
+            ),
+        )
+
     def sampled(
         self,
         key: PRNGKeyArray,
@@ -147,6 +202,10 @@ class AttachmentBelief(eqx.Module):
         low, high = mixture.quantile(TAIL), mixture.quantile(1 - TAIL)
         lower = jnp.where(free, 0.0, self.stiffness(low))
         return lower, jnp.where(high > OPEN, jnp.inf, self.stiffness(high))
+
+    def mixture(self) -> Mixture:
+        """Each particle's own distribution of s."""
+        return self._mixture(*self._cavity(self.gaussian()))[0]
 
     def gaussian(self) -> "Gaussian":
         """Evidence and sites together."""

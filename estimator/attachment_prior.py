@@ -9,7 +9,7 @@ over the mesh [Besag 1986, doi:10.1111/j.2517-6161.1986.tb01412.x],
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.estimator.mesh import neighbour_table, symmetric
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 
@@ -18,8 +18,8 @@ class AttachmentPrior(eqx.Module):
     """Free or attached, and how stiffly."""
 
     stiffness: SpikeAndSlab
-    log_odds: Float[Array, ""]
-    """h: of a particle without attached neighbours."""
+    log_odds: Float[Array, " n"]
+    """h: of each particle without attached neighbours; the same for all, but where something was cut or sewn."""
     coupling: Float[Array, ""]
     """J: what each attached neighbour adds to the log odds."""
     neighbours: Int[Array, "n d"]
@@ -42,8 +42,36 @@ class AttachmentPrior(eqx.Module):
         back = np.argmax(table[table] == np.arange(n)[:, None, None], axis=2)
         return cls(
             stiffness=stiffness,
-            log_odds=jnp.asarray(np.log(probability) - np.log1p(-probability)),
+            log_odds=jnp.full(n, np.log(probability) - np.log1p(-probability)),
             coupling=jnp.asarray(coupling, dtype=float),
             neighbours=jnp.asarray(np.where(table < 0, n, table)),
             back=jnp.asarray(back),
         )
+
+    def parted(
+        self, region: Bool[Array, " n"], probability: Float[Array, " n"], message: Float[Array, "n d"]
+    ) -> tuple["AttachmentPrior", Float[Array, "n d"]]:
+        """After something was done to a region: it has odds of its own, and its edge to the others is no edge now.
+
+        What the region told the others of what was before stays with them.
+
+        Args:
+            region: the particles.
+            probability: P(attached) of each from now on; used in the region alone.
+            message: log odds that each neighbour told.
+
+        Returns:
+            The prior, and what neighbours tell from now on.
+        """
+        inside = jnp.append(region, False)[self.neighbours]
+        across = (inside != region[:, None]) & (self.neighbours < len(region))
+        tells = jnp.append(jnp.log1p(probability * jnp.expm1(self.coupling)), 0.0)[self.neighbours]
+        told = jnp.where(across, 0.0, jnp.where(region[:, None], tells, message))
+        odds = jnp.log(probability) - jnp.log1p(-probability) - jnp.sum(told, axis=1)
+        kept = self.log_odds + jnp.sum(jnp.where(across, message, 0.0), axis=1)
+        changed = eqx.tree_at(
+            lambda prior: (prior.log_odds, prior.neighbours),
+            self,
+            (jnp.where(region, odds, kept), jnp.where(across, len(region), self.neighbours)),
+        )
+        return changed, told

@@ -153,7 +153,7 @@ def large_step(
         tip, _ = jax.lax.scan(one, tip, length=iterations)
         return tip, loss(tip)
 
-    tips, found = _each(descended, tips)
+    tips, found = each(descended, tips)
     found = jnp.where(jnp.isfinite(found), found, jnp.inf)
     order = jnp.argsort(found)
     return Samples(tips=tips[order], loss=found[order])
@@ -174,10 +174,10 @@ PRIMITIVES = {
 """The paper's motion primitives; down is forbidden, as the ground is there."""
 
 
-def _each(function: Callable, tips: Float[Array, "k 3"]):
-    """Of every tip: one after the other on a CPU, which is faster there, and at once on a GPU."""
+def each(function: Callable, inputs):
+    """Of every input along the leading axis: in turn on a CPU, which is faster there, and at once on a GPU."""
     return jax.lax.platform_dependent(
-        tips, cpu=lambda tips: jax.lax.map(function, tips), default=lambda tips: jax.vmap(function)(tips)
+        inputs, cpu=lambda inputs: jax.lax.map(function, inputs), default=lambda inputs: jax.vmap(function)(inputs)
     )
 
 

@@ -22,20 +22,24 @@ from jiggle_mj.estimator.filters.implicit import ImplicitFilter
 from jiggle_mj.estimator.grip import GripHold
 from jiggle_mj.estimator.identification import identify
 from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.outlook import Outlook
 from jiggle_mj.estimator.perception import CloudTracker, Disparity, PointTracker, StereoTracker, TissueMask, Track
 from jiggle_mj.estimator.perception.cloud_tracker import lay_mesh
 from jiggle_mj.estimator.perception.mesh_field import MeshField
+from jiggle_mj.estimator.topology import Change, after, region_of
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.material import Material, material
 from jiggle_mj.mesh_checks import check_unfolded
-from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
+from jiggle_mj.observation import Cut, Declaration, MeasuredPoints, Observation, StereoPair, Suture, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
 RULE = "P(attached) > 0.5"
 """Of filters that state a probability."""
+SEEN = 3e-4
+"""Standard deviation of a seen coordinate before the first frame has said how well it is seen [m]."""
 
 
 class Estimator:
@@ -74,6 +78,12 @@ class Estimator:
         self._filter: Filter | None = None
         self._hold: GripHold | None = None
         self._closing: ToolState | None = None
+        self._tool: ToolState | None = None
+        self._sight = np.eye(3) * SEEN**-2
+        self.changes: list[Change] = []
+        """Cuts and sutures so far, as the belief took them; of the filter 'implicit' alone."""
+        self._idle: Observation | None = None
+        self._slip = 0.0
         self._used = False
         self._converged = True
 
@@ -87,6 +97,63 @@ class Estimator:
         self._check_begun()
         assert self._sheet is not None
         return self._sheet
+
+    def begin(self) -> Sheet:
+        """Fix the sheet by the frames so far, before the jaws close, so that a first grasp can be planned.
+
+        Raises:
+            PerceptionError: nothing was seen that a sheet could be laid over.
+            MeshError: the sheet at rest is folded, or not one sheet.
+        """
+        if self._filter is None:
+            if self._sheet is None and not self._still:
+                raise PerceptionError("no frame has shown the sheet yet; wait for one before planning a grasp.")
+            with jax.enable_x64(True), one_thread():
+                self._filter = self._begin()
+        return self.sheet
+
+    @property
+    def positions(self) -> Float[np.ndarray, "n 3"]:
+        """Where the particles are [m]: as believed while the jaws hold some, else as last seen, or at rest."""
+        self._check_begun()
+        if self._hold is not None:
+            return self._x
+        if self._idle is not None:
+            with jax.enable_x64(True), one_thread():
+                self._lying, self._idle = self._lies(self._idle), None
+        return self._lying
+
+    @property
+    def hold(self) -> GripHold | None:
+        """What the jaws hold; None while they are open."""
+        return self._hold
+
+    @property
+    def slip(self) -> float:
+        """How far the held particles were last seen from where the tip should have taken them, in the median [m]."""
+        return 0.0 if self._hold is None else self._slip
+
+    @property
+    def tool(self) -> ToolState | None:
+        """As the robot last reported it."""
+        return self._tool
+
+    def loaded(self, held: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Particles that a grip on those which are held may pull at, themselves among them."""
+        self._check_begun()
+        return self._field.widened(held)
+
+    def outlook(self) -> Outlook:
+        """What pulls would show and cost, as far as is believed now; `release` first, once a grasp is over.
+
+        Raises:
+            ValueError: asked before `begin`, or of another filter than 'implicit'.
+        """
+        self._check_begun()
+        if not (isinstance(self._filter, ImplicitFilter) and isinstance(self._belief, AttachmentBelief)):
+            raise ValueError(f"only the filter 'implicit' predicts pulls; this one is {self.config.filter!r}.")
+        position = 1.0 if self._filter.noise is None else self._filter.noise.position
+        return Outlook(balance=self._filter.balance, belief=self._belief, precision=jnp.asarray(self._sight / position))
 
     @property
     def belief(self) -> Belief:
@@ -162,15 +229,19 @@ class Estimator:
     def release(self) -> None:
         """Say that the grasp is over: its frames are judged again in the light of all of them.
 
-        Happens by itself when the jaws open or a new grasp begins; needed only where observations end with closed jaws.
+        Happens by itself when the jaws open or a new grasp begins; needed only where observations end with closed
+        jaws, or where the settings leave the judging to the end.
 
         Raises:
             PerceptionError: no finite belief explains the frames together; what was believed before stays.
         """
+        self._release(thorough=True)
+
+    def _release(self, *, thorough: bool) -> None:
         if self._filter is None:
             return
         with jax.enable_x64(True), one_thread():
-            if (again := self._filter.release(self._belief)) is not None:
+            if (again := self._filter.release(self._belief, thorough=thorough)) is not None:
                 self._judge(again)
 
     def identify(self, *, on_pass: Callable[[dict[str, float]], None] = lambda _: None) -> Material:
@@ -194,18 +265,22 @@ class Estimator:
         return material(self.declaration, factors, log_sd, converged=converged)
 
     def _update(self, observation: Observation) -> Estimate | None:
-        tool = observation.tool
+        tool = self._tool = observation.tool
         if self._filter is None:
             self._look_at_rest(observation)
-            if not tool.closed:
+            if not (tool.closed or observation.events):
                 return None
-            self._filter = self._begin()
+            self.begin()
+        for event in observation.events:
+            self._change(event, observation.index)
+        assert self._filter is not None
         if not tool.closed:
-            self.release()
+            self._release(thorough=self.config.judge_each_grasp)
             self._hold = self._closing = None
+            self._idle = observation
             return None
         if self._closing is None or self._closing.grasp != tool.grasp:
-            self.release()
+            self._release(thorough=self.config.judge_each_grasp)
             self._closing = tool
         began = time.perf_counter()
         track = self._see(observation)
@@ -238,6 +313,41 @@ class Estimator:
             perception_s=seen - began,
             converged=bool(update.converged),
         )
+
+    def _change(self, event: Cut | Suture, index: int) -> None:
+        """Take a cut or suture into the belief, before the observation that it was seen with."""
+        region = region_of(event, self.sheet.rest)
+        if not region.any():
+            self.skipped.append((index, f"the {type(event).__name__.lower()} is beside the sheet, and was left out"))
+            return
+        self._release(thorough=self.config.judge_each_grasp)
+        assert self._filter is not None
+        if isinstance(self._belief, AttachmentBelief) and isinstance(self._filter, ImplicitFilter):
+            if self.changes:
+                self.changes[-1].evidence = self._filter.evidence()
+            self.changes.append(Change(event=event, index=index, region=region, before=self._belief))
+            self._believe(self._filter.restart(after(self._belief, event, region)))
+            return
+        assert isinstance(self._belief, BoundaryBelief)
+        meant = event.stiffness if isinstance(event, Suture) else 0.0
+        change = jnp.where(region, meant - self._belief.mean(), 0.0)
+        sd = max(self.config.prior_sd * self.declaration.membrane_stiffness, meant)
+        self._belief = self._belief.predict(change, jnp.where(region, sd**2, 0.0))
+        self._b = np.asarray(self._belief.non_negative_mean())
+        self._filter.forget()
+
+    def worked(self, change: Change) -> float | None:
+        """Log Bayes factor of 'it worked' against 'nothing changed'; None before a frame that says anything of it.
+
+        Frames since the change and before the next are looked at.
+        """
+        if not isinstance(self._filter, ImplicitFilter):
+            raise ValueError(f"only the filter 'implicit' can tell; this one is {self.config.filter!r}.")
+        evidence = change.evidence if change is not self.changes[-1] else self._filter.evidence()
+        if evidence is None:
+            return None
+        with jax.enable_x64(True), one_thread():
+            return change.log_bayes_factor(*evidence)
 
     def _believe(self, stated: Stated) -> None:
         self._belief, self._b, self._sd = stated.belief, np.asarray(stated.b), np.asarray(stated.sd)
@@ -289,7 +399,8 @@ class Estimator:
         self._field = MeshField(plane.flatten(mesh.rest), mesh.faces)
         found, self._belief = build_filter(mesh, self.declaration, self.config)
         self.prior_entropy = float(self._belief.entropy())
-        self._x, self._b = mesh.rest, np.zeros(mesh.n)
+        self._x = self._lying = mesh.rest
+        self._b = np.zeros(mesh.n)
         self._sd = self._probability = np.full(mesh.n, np.nan)
         return found
 
@@ -323,6 +434,20 @@ class Estimator:
             return self._points.track(observation.points)
         raise PerceptionError(f"observation {observation.index} has neither points nor images; one is needed.")
 
+    def _lies(self, observation: Observation) -> Float[np.ndarray, "n 3"]:
+        """Where the sheet lies with the jaws open; what is not seen moves with its surroundings."""
+        rest = self.sheet.rest
+        try:
+            if self._clouds is not None:
+                return rest
+            track = self._see(observation)
+        except PerceptionError:
+            return rest
+        if not track.visible.any():
+            return rest
+        off = np.where(track.visible[:, None], np.nan_to_num(track.positions) - rest, 0.0)
+        return rest + self._field.fill(off, track.visible, stiffness=1.0)
+
     def _grip(self, track: Track, tool: ToolState) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
         """The grasp of this frame, and the state to start from: the last, or rest where the jaws have just closed.
 
@@ -345,7 +470,10 @@ class Estimator:
     ) -> tuple[Evidence, Float[np.ndarray, "n 3"]]:
         """Fuse what was seen with what the grip says; and a start for the state, smooth where nothing was seen."""
         seen, held, expected = track.visible, hold.held, hold.expected(tool)
+        off = np.linalg.norm((track.positions - expected)[seen & held], axis=1)
+        self._slip = float(np.median(off)) if len(off) else 0.0
         precision = np.where(seen[:, None, None], np.linalg.inv(track.covariance), 0.0)
+        self._sight = precision[seen].mean(axis=0)
         weighed = np.einsum("nij,nj->ni", precision, np.nan_to_num(track.positions))
         grip = np.where(held, self.config.grip_sd**-2, 0.0)
         precision = precision + grip[:, None, None] * np.eye(3)

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jiggle_mj.mesh_checks import check_mesh
 
@@ -47,6 +47,15 @@ class SheetMesh:
         half = half[np.lexsort(half.T[::-1])]
         twin = np.flatnonzero(np.all(half[:-1, :2] == half[1:, :2], axis=1))
         return np.column_stack([half[twin, :2], half[twin, 2], half[twin + 1, 2]])
+
+    @cached_property
+    def border(self) -> Bool[np.ndarray, " n"]:
+        """Particles on the sheet's edge."""
+        half = np.sort(self._half_edges[:, :2], axis=1)
+        edges, faces = np.unique(half, axis=0, return_counts=True)
+        on_edge = np.zeros(self.n, dtype=bool)
+        on_edge[edges[faces == 1]] = True
+        return on_edge
 
     @cached_property
     def face_area(self) -> Float[np.ndarray, " f"]:

@@ -5,14 +5,15 @@ written.
 """
 
 import platform
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import Disparity, TissueMask
+from jiggle_mj.eval.acting import actions, acts, check_goes_with, policy_named
 from jiggle_mj.eval.report import shown_steps, write_report
 from jiggle_mj.eval.score import IDENTITY, RECORDED, Json, read_scorable, result, score_read, write_result
 
@@ -29,9 +30,11 @@ from jiggle_mj.episode import (
     estimate,
     observe,
     recording_identity,
+    settings,
 )
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
+from jiggle_mj.limits import Limits
 from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.observation import StereoPair
 from jiggle_mj.recording import Recording
@@ -50,6 +53,8 @@ def run_scene(
     *,
     seed: int = 0,
     sensing: "Sensing" = "stereo",
+    policy: str | None = None,
+    steps: int | None = None,
     config: EstimatorConfig | None = None,
     mask: TissueMask | None = None,
     disparity: Disparity | None = None,
@@ -59,10 +64,12 @@ def run_scene(
     """The main job: reference tissue, observations, estimate, score, report.
 
     Args:
-        scene: the tissue and the grasp programme.
+        scene: the tissue, the grasp programme and the limits of a policy.
         directory: where the files go.
         seed: of the sensing noise; the same seed gives the same recording.
         sensing: what the estimator sees.
+        policy: who chooses the pulls, one of `POLICIES`; the scene's own if None.
+        steps: how many actions a policy may take at most; the programme takes its own.
         config: of the estimator.
         mask: see `Estimator`.
         disparity: see `Estimator`.
@@ -75,16 +82,23 @@ def run_scene(
     Raises:
         JiggleError: what any of the parts raises.
     """
-    from jiggle_mj.scenes import Reference, programme  # here, so that a recording can be estimated without MuJoCo
+    from jiggle_mj.scenes import Reference  # here, so that a recording can be estimated without MuJoCo
 
+    policy = policy or scene.programme.policy
+    chooses, config = policy_named(policy, scene, seed=seed), config or EstimatorConfig()
+    if chooses is not None:
+        config = replace(config, judge_each_grasp=False)
+        check_goes_with(chooses, config)
     own = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
     check_directory(directory, own, overwrite=overwrite)
     watch = Stopwatch()
     with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference:
         estimator = Estimator(reference.declaration, reference.camera, config=config, mask=mask, disparity=disparity)
         clear_directory(directory, own)
-        about = {RECORDED: scene.name, IDENTITY: recording_identity(scene, sensing, seed)}
-        frames = observe(reference, programme(scene), directory / RECORDING, seed=seed, watch=watch)
+        said = "" if chooses is None else f"{policy}, {steps} steps, {settings(estimator.config)}"
+        about = {RECORDED: scene.name, IDENTITY: recording_identity(scene, sensing, seed, said)}
+        does = actions(scene, chooses, estimator, steps)
+        frames = observe(reference, does, directory / RECORDING, seed=seed, policy=said, watch=watch)
         episode = estimate(frames, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
     unscored = _result(
         episode,
@@ -92,9 +106,13 @@ def run_scene(
         seed=seed,
         sensing=sensing,
         estimator=estimator.config.filter,
-        policy="corners",
+        policy=policy,
         disturbances=reference.metadata.get("disturbances"),
         simulation_s=watch.seconds,
+        limits=scene.limits.limits(),
+        plan_s=[] if chooses is None else [one.plan_s for one in chooses.decisions],
+        ended=None if chooses is None else chooses.ended,
+        procedure=acts(chooses, estimator),
     )
     write_result(directory / RESULT, unscored)
     unscored, found, truth = read_scorable(directory, truth_path(directory / RECORDING))
@@ -236,6 +254,10 @@ def _result(
     policy: str,
     disturbances: str | None,
     simulation_s: float | None = None,
+    limits: Limits | None = None,
+    plan_s: Sequence[float] = (),
+    ended: str | None = None,
+    procedure: Json | None = None,
 ) -> Json:
     return result(
         scene=scene,
@@ -251,4 +273,8 @@ def _result(
         n_frames=episode.n_frames,
         skipped=episode.skipped,
         simulation_s=simulation_s,
+        limits=limits,
+        plan_s=plan_s,
+        ended=ended,
+        procedure=procedure,
     )

@@ -2,8 +2,6 @@
 
 `result` makes the whole skeleton from what the estimator knows, with null for all that needs the truth; `with_truth`
 fills that in; `score` does it for a folder on disk. Fractions, not per cent; null where undefined.
-
-Not judged yet, and null: the limit on the boundary energy and its violations, and the time of planning.
 """
 
 import copy
@@ -17,11 +15,13 @@ from jaxtyping import Bool
 from jiggle_mj.eval.calibration import Calibration, calibration
 from jiggle_mj.eval.carrying import CarriedTruth, carry
 from jiggle_mj.eval.metrics import DILATIONS, agreement, average_precision
-from jiggle_mj.eval.tracking import mean_boundary_energy, tracking
+from jiggle_mj.eval.safety import borne
+from jiggle_mj.eval.tracking import tracking
 
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
+from jiggle_mj.limits import Limits
 from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import read_truth
 
@@ -46,6 +46,10 @@ def result(
     n_frames: int,
     skipped: Sequence[tuple[int, str]] = (),
     simulation_s: float | None = None,
+    limits: Limits | None = None,
+    plan_s: Sequence[float] = (),
+    ended: str | None = None,
+    procedure: Json | None = None,
 ) -> Json:
     """All keys of `result.json`, before any truth is seen.
 
@@ -63,6 +67,10 @@ def result(
         n_frames: of the recording: used, skipped and those with open jaws.
         skipped: index and reason of each frame that was left out.
         simulation_s: wall time of the reference tissue, all frames [s]; None for a recording.
+        limits: of what the attachments may bear; None for a recording.
+        plan_s: wall time of each plan of a policy [s].
+        ended: why a policy planned no more.
+        procedure: of one that cuts or sews, its name and what was seen of each act; see `acting.acts`.
     """
     update = np.array([estimate.update_s for estimate in estimates])
     perception = np.array([estimate.perception_s for estimate in estimates])
@@ -88,7 +96,16 @@ def result(
         "noise": {"force_sd_ratio": detection.force_sd_ratio, "position_sd_ratio": detection.position_sd_ratio},
         "calibration": dict.fromkeys(field.name for field in fields(Calibration)),
         "tracking": {"rms_m": None},
-        "safety": {"limit_j": None, "max_mean_boundary_energy_j": None, "violations": None},
+        "safety": {
+            "limit_j": None if limits is None else limits.energy,
+            "max_mean_boundary_energy_j": None,
+            "violations": None,
+            "limit_n": None if limits is None else limits.force,
+            "max_force_n": None,
+            "force_violations": None,
+        },
+        "ended": ended,
+        "procedure": procedure,
         "entropy": {
             "prior": _number(prior_entropy),
             "final": _number(estimates[-1].entropy) if estimates else None,
@@ -104,7 +121,7 @@ def result(
                 "p95": float(np.percentile(update, 95)) if len(update) else None,
             },
             "perception_s": float(np.median(perception)) if len(perception) else None,
-            "plan_s": None,
+            "plan_s": float(np.median(plan_s)) if len(plan_s) else None,
             "simulation_s": _number(simulation_s),
         },
     }
@@ -138,7 +155,9 @@ def with_truth(
         )
     _section(scored, "calibration").update(vars(judged))
     _section(scored, "tracking").update(rms_m=tracking(sheet, estimates, truth).rms)
-    _section(scored, "safety").update(max_mean_boundary_energy_j=mean_boundary_energy(truth))
+    _section(scored, "safety").update(_judged(_section(scored, "safety"), truth))
+    if scored.get("procedure") is not None:
+        _section(scored, "procedure").update(_succeeded(_section(scored, "procedure"), truth))
     return scored
 
 
@@ -230,6 +249,30 @@ def _agreements(
         one = agreement(detection.attached, carried.attached, sheet.faces, rings, knowable=knowable)
         by_dilation[str(rings)] = {"pcd": one.pcd, "pug": one.pug, "f1": one.f1}
     return by_dilation
+
+
+def _judged(safety: Json, truth: Truth) -> Json:
+    """What the attachments bore at most, and in how many frames it was too much."""
+    loads = borne(truth)
+    energy, force = loads.most
+    limit_j, limit_n = safety.get("limit_j"), safety.get("limit_n")
+    return {
+        "max_mean_boundary_energy_j": energy,
+        "violations": loads.violations(energy=limit_j) if isinstance(limit_j, float) else None,
+        "max_force_n": force,
+        "force_violations": loads.violations(force=limit_n) if isinstance(limit_n, float) else None,
+    }
+
+
+def _succeeded(procedure: Json, truth: Truth) -> Json:
+    """Whether each act worked, and the procedure: is the tissue free, or its last suture in place?"""
+    done = truth.details.get("events", [])
+    acts = procedure["acts"]
+    assert isinstance(done, list) and isinstance(acts, list)
+    told = [one | {"succeeded": true["succeeded"]} for one, true in zip(acts, done, strict=True)]
+    if procedure["name"] == "detach":
+        return {"acts": told, "success": not (truth.frames[-1].stiffness != 0).any()}
+    return {"acts": told, "success": bool(told) and told[-1]["succeeded"]}
 
 
 def _section(figures: Json, name: str) -> Json:

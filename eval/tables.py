@@ -4,7 +4,8 @@ A table that was interrupted goes on where it was: a folder with a scored result
 the estimator's settings were others. Give a new folder after any other change.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,6 +78,25 @@ def measure(
                 done = run_scene(load_scene(row.scene), folder, seed=seed, sensing=row.sensing, overwrite=True)
             found[row].append(done)
     return found
+
+
+def carry_out(runs: Mapping[str, Callable[[], object]], executor: Executor, *, say: Callable[[str], None]) -> None:
+    """Runs by name, several at a time; the first that fails ends them, and what is finished stays.
+
+    Args:
+        runs: what to call, which must go through pickle.
+        executor: calls it.
+        say: told of each run that is done.
+    """
+    left = {executor.submit(run): name for name, run in runs.items()}
+    try:
+        for number, done in enumerate(as_completed(left), start=1):
+            done.result()
+            say(f"{number} of {len(left)}: {left[done]}")
+    except BaseException:
+        for waiting in left:
+            waiting.cancel()
+        raise
 
 
 def markdown(results: dict[Row, list[Json]]) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.eval.carrying import barycentric_weights, stiffness_at
+from jiggle_mj.eval.carrying import barycentric_weights
 
 from jiggle_mj.estimate import Estimate, Sheet
 from jiggle_mj.truth import Truth
@@ -50,21 +50,6 @@ def tracking(sheet: Sheet, estimates: Sequence[Estimate], truth: Truth) -> Track
         per_frame=np.array([_rms(each) for each in squared], dtype=float),
         per_frame_estimate=np.array([_rms(each) for each in squared_estimate], dtype=float),
     )
-
-
-def mean_boundary_energy(truth: Truth) -> float | None:
-    """Largest over the frames of the mean boundary energy at the true stiffness and positions [J].
-
-    None without frames, or if nothing is attached by a stiffness that is a number at a place that is known.
-    """
-    energies = []
-    for frame in truth.frames:
-        stiffness = stiffness_at(truth, frame)
-        known = np.isfinite(stiffness) & np.isfinite(frame.positions).all(axis=1)
-        if (known & (stiffness > 0)).any() or not (stiffness != 0).any():
-            stretched = np.sum((frame.positions - truth.rest)[known] ** 2, axis=1)
-            energies.append(float(0.5 * stiffness[known] @ stretched / len(stiffness)))
-    return max(energies, default=None)
 
 
 def _rms(squared: Float[np.ndarray, " m"]) -> float | None:

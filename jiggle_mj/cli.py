@@ -20,6 +20,7 @@ from rich.table import Table
 
 from jiggle_mj.allocator import keep_freed_memory
 from jiggle_mj.errors import JiggleError, OptionError, OutputError, SceneError
+from jiggle_mj.policies import PolicyName
 
 if TYPE_CHECKING:
     from jiggle_mj.episode import OnFrame
@@ -44,6 +45,8 @@ def run(
     *,
     out: Out,
     sensing: Sensing = "stereo",
+    policy: PolicyName | None = None,
+    steps: int | None = None,
     estimator: FilterName = "implicit",
     seed: int = 0,
     disturb: Disturb = (),
@@ -57,6 +60,10 @@ def run(
         out: folder for run.mcap, run.truth.mcap, estimate.mcap, result.json and report.html.
         sensing: what the estimator sees: images; noisy tracked points of the tissue; noisy vertices of the reference; a
             noisy cloud of other points in each frame.
+        policy: who chooses the pulls, if not whom the scene names: corners is its programme; information is ours,
+            one-grasp is ours without letting go; detach cuts what it finds, suture sews; sl-d, lg-d, lg-h and pmp-WAY
+            are the paper's, which move one grasp.
+        steps: how many actions a policy may take: 40 if left out, 400 of detach and suture.
         estimator: implicit is ours; explicit is the paper's filter, adam its baseline; nnls and unscented are others'.
         seed: of the sensing noise.
         disturb: something that nobody tells the estimator of, such as gravity=0.5; any number of times. The names are
@@ -65,13 +72,22 @@ def run(
         as_json: print result.json to stdout.
     """
     from jiggle_mj.estimator import EstimatorConfig
+    from jiggle_mj.eval.acting import most_actions
     from jiggle_mj.eval.experiment import run_scene
-    from jiggle_mj.scenes import disturbed, load_scene, programme
+    from jiggle_mj.scenes import disturbed, load_scene
 
     loaded, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)
-    with _progress(sum(1 for _ in programme(loaded)), f"run {loaded.name}") as on_frame:
+    with _progress(most_actions(loaded, policy, steps), f"run {loaded.name}") as on_frame:
         figures = run_scene(
-            loaded, out, seed=seed, sensing=sensing, config=config, overwrite=overwrite, on_frame=on_frame
+            loaded,
+            out,
+            seed=seed,
+            sensing=sensing,
+            policy=policy,
+            steps=steps,
+            config=config,
+            overwrite=overwrite,
+            on_frame=on_frame,
         )
     _show(figures, out, as_json)
 
@@ -312,26 +328,48 @@ def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = N
 
 
 def table(
-    name: Annotated[Literal["main", "simulation", "one-lift"], tyro.conf.Positional],
+    name: Annotated[Literal["main", "active", "simulation", "one-lift"], tyro.conf.Positional],
     /,
     *,
     out: Out,
     seeds: tuple[int, ...] | None = None,
+    sensing: Sensing | None = None,
+    jobs: int | None = None,
 ) -> None:
     """Run a table of scenes and seeds, and print it as Markdown; what is in OUT already is not run again.
 
     Args:
-        name: main is the README's; simulation and one-lift are the paper's, with its printed figures and all baselines.
-        out: holds a folder for each run.
+        name: main is the README's; active is the paper's comparison of policies, with ours; simulation and one-lift are
+            the paper's, with its printed figures and all baselines.
+        out: holds a folder for each run, and of active the curves, active.html.
         seeds: of each row; 0 to 2 for main and 0 to 9 for the paper's if left out.
+        sensing: of active; particles if left out.
+        jobs: of active: how many runs at a time; as many as there are usable cores if left out.
     """
-    from jiggle_mj.eval import paper_tables, tables
+    from jiggle_mj.eval import active_table, paper_tables, tables
+    from jiggle_mj.worker_processes import WorkerProcesses
 
     def say(text: str) -> None:
         console.print(text, highlight=False)
 
+    if name != "active" and (sensing is not None or jobs is not None):
+        raise OptionError(f"--{'jobs' if sensing is None else 'sensing'} is for the table active; got {name}.")
     if name == "main":
         print(tables.markdown(tables.measure(tables.MAIN, seeds or range(3), out, say=say)))
+    elif name == "active":
+        with WorkerProcesses(jobs) as executor:
+            runs = active_table.measure(
+                active_table.SCENES,
+                active_table.POLICIES,
+                seeds or range(10),
+                out,
+                sensing=sensing or "particles",
+                executor=executor,
+                say=say,
+            )
+        print(active_table.markdown(runs))
+        active_table.write_curves(runs, out / active_table.FILE)
+        console.print(f"curves: {out / active_table.FILE}")
     else:
         table, cells = paper_tables.TABLES[name], paper_tables.cells()
         print(paper_tables.markdown(table, paper_tables.measure(table, cells, seeds or range(10), out, say=say)))

@@ -91,11 +91,11 @@ def clear_directory(directory: Path, names: Iterable[str]) -> None:
         raise OutputError(f"{directory} cannot be written ({failure.strerror}); give another folder.") from failure
 
 
-def recording_identity(scene: "Scene", sensing: str, seed: int) -> str:
-    """Ties a recording, its truth and its estimate together: a digest of scene, sensing and seed."""
+def recording_identity(scene: "Scene", sensing: str, seed: int, policy: str = "") -> str:
+    """Ties a recording, its truth and its estimate together: a digest of all that they depend on."""
     from jiggle_mj.scenes import scene_table  # here, so that a recording can be estimated without MuJoCo
 
-    return identity(scene_table(scene), sensing, seed)
+    return identity(scene_table(scene), sensing, seed, policy)
 
 
 def observe(
@@ -104,6 +104,7 @@ def observe(
     path: Path | None = None,
     *,
     seed: int,
+    policy: str = "",
     overwrite: bool = False,
     watch: Stopwatch | None = None,
 ) -> Iterator[Observation]:
@@ -114,6 +115,7 @@ def observe(
         actions: what to do; may be a policy that looks at the estimate before it yields the next.
         path: where to record, truth in a file of its own beside it; None for nowhere.
         seed: of the run, for the recording's metadata.
+        policy: who chooses the actions, with all that it depends on; empty for the scene's programme.
         overwrite: replace files that are there.
         watch: adds up the time of the simulation.
     """
@@ -121,7 +123,8 @@ def observe(
     with ExitStack() as files:
         recording = truth_file = None
         if path is not None:
-            start, name = reference.truth(), recording_identity(reference.scene, reference.sensing, seed)
+            start = reference.truth()
+            name = recording_identity(reference.scene, reference.sensing, seed, policy)
             about = {"name": start.scene, "seed": str(seed), "sensing": reference.sensing, "identity": name}
             recording = files.enter_context(
                 RecordingWriter(

@@ -7,7 +7,7 @@ shapes meet they must agree on how they hold, because a vertex is held in one wa
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from itertools import combinations, pairwise
+from itertools import combinations
 from typing import ClassVar
 
 import numpy as np
@@ -15,20 +15,7 @@ from jaxtyping import Float, Int
 from jiggle_mj.scenes.section import Section, number, points, stiffness, vector
 
 from jiggle_mj.errors import SceneError
-
-
-def _distance_to_segment(
-    p: Float[np.ndarray, "n 2"], start: Float[np.ndarray, " 2"], end: Float[np.ndarray, " 2"]
-) -> Float[np.ndarray, " n"]:
-    along = end - start
-    share = np.clip((p - start) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
-    return np.linalg.norm(p - start - share[:, None] * along, axis=1)
-
-
-def distance_to_path(p: Float[np.ndarray, "n 2"], path: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, " n"]:
-    """From points to an open line of straight pieces, or to the only point of it [m]."""
-    ends = pairwise(path) if len(path) > 1 else [(path[0], path[0])]
-    return np.min([_distance_to_segment(p, start, end) for start, end in ends], axis=0)
+from jiggle_mj.regions import distance_to_segment
 
 
 def _cross(*corners: tuple[float, float]) -> bool:
@@ -95,7 +82,7 @@ class Segment(Attachment):
 
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """From points to the segment [m]."""
-        return _distance_to_segment(p, np.array(self.start), np.array(self.end))
+        return distance_to_segment(p, np.array(self.start), np.array(self.end))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +149,7 @@ class Polygon(Attachment):
         outline = np.full(len(p), np.inf)
         inside = np.zeros(len(p), dtype=bool)
         for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            outline = np.minimum(outline, _distance_to_segment(p, start, end))
+            outline = np.minimum(outline, distance_to_segment(p, start, end))
             crosses = (start[1] > p[:, 1]) != (end[1] > p[:, 1])
             with np.errstate(divide="ignore", invalid="ignore"):
                 x = start[0] + (p[:, 1] - start[1]) * (end[0] - start[0]) / (end[1] - start[1])

@@ -5,11 +5,11 @@ The region is in tissue coordinates, that of the sheet at rest. Whether it succe
 
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.scenes.attachments import distance_to_path
 from jiggle_mj.scenes.simulation import Simulation
 
 from jiggle_mj.errors import ActionError
 from jiggle_mj.observation import Cut, Suture
+from jiggle_mj.regions import distance_to_path
 
 
 def carry_out(event: Cut | Suture, simulation: Simulation, rng: np.random.Generator) -> dict[str, object]:

@@ -5,15 +5,17 @@ degrees and their names say so. Nothing here touches MuJoCo.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import ClassVar
 
 from jiggle_mj.scenes.attachments import Attachment
 from jiggle_mj.scenes.disturbance import Disturbance
 from jiggle_mj.scenes.section import Section, choice, integer, number, points, switch, vector
 
+from jiggle_mj import limits
 from jiggle_mj.errors import SceneError
 from jiggle_mj.observation import Declaration
+from jiggle_mj.policies import POLICIES
 
 MOST = 20_000
 """Vertices of a sheet."""
@@ -69,6 +71,8 @@ class Programme(Section):
     """Grasps and lifts, one point after the other."""
 
     section: ClassVar[str] = "programme"
+    policy: str = choice("corners", among=POLICIES)
+    """Who chooses the pulls in `run`, if nothing else is said; `corners` are the grasps below."""
     still_frames: int = integer(20, at_least=1, at_most=1000)
     """Frames before the first grasp, from which noise can be learned."""
     points: tuple[tuple[float, float], ...] = points((), at_least=0)
@@ -95,8 +99,37 @@ class Procedure(Section):
     """Chance that a suture does not hold."""
     suture_slack: float = number(0.0, unit="m", at_least=0, at_most=0.05)
     """Length up to which the thread is loose."""
+    suture_length: float = number(0.03, unit="m", above=0, at_most=1)
+    """Of what the policy `suture` sews [m]."""
+    suture_width: float = number(7e-3, unit="m", above=0, at_most=1)
+    """Of the band that it sews [m]."""
+    suture_stiffness: float = number(1.0, unit="N/m", above=0, at_most=1e6)
+    """Of each vertex that it sews [N/m]."""
     suture_offset: tuple[float, float, float] = vector((0.0, 0.0, 0.0), length=3, unit="m")
     """Where a suture ends, from where its vertex lies at rest; world [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits(Section):
+    """What a policy may ask of the attachments, and where it may take the tip."""
+
+    section: ClassVar[str] = "limits"
+    energy: float = number(1e-7, unit="J", above=0, at_most=1)
+    """Mean over all particles of the energy in their attachments [J]."""
+    force: float = number(1e-2, unit="N", above=0, at_most=1e3)
+    """On any one attachment [N]."""
+    chance: float = number(0.01, above=0, below=0.5)
+    """Largest probability with which a planned step may exceed one of the two."""
+    unknown: float = number(1.0, unit="N/m", above=0, at_most=1e6)
+    """Stiffness of attachments that nobody knows of yet, as a plan reckons with them [N/m]."""
+    ceiling: float = number(0.06, unit="m", above=0, at_most=1)
+    """Greatest height of the tip above the bed [m]."""
+    beside: float = number(0.01, unit="m", above=0, at_most=1)
+    """How far beyond the resting sheet's extent the tip may go sideways [m]."""
+
+    def limits(self) -> limits.Limits:
+        """In the shared vocabulary."""
+        return limits.Limits(**{one.name: getattr(self, one.name) for one in fields(self)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,6 +228,7 @@ class Scene:
     tweezer: Tweezer = field(default_factory=Tweezer)
     programme: Programme = field(default_factory=Programme)
     procedure: Procedure = field(default_factory=Procedure)
+    limits: Limits = field(default_factory=Limits)
     camera: Camera = field(default_factory=Camera)
     lights: Lights = field(default_factory=Lights)
     texture: Texture = field(default_factory=Texture)

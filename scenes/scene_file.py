@@ -18,6 +18,7 @@ from jiggle_mj.scenes.scene import (
     Camera,
     Declared,
     Lights,
+    Limits,
     Procedure,
     Programme,
     Scene,
@@ -31,7 +32,8 @@ from jiggle_mj.scenes.section import Section, checked
 from jiggle_mj.errors import SceneError
 
 SECTIONS: dict[str, type[Section]] = {
-    cls.section: cls for cls in (Tissue, Bed, Tweezer, Programme, Procedure, Camera, Lights, Texture, Sensing, Declared)
+    cls.section: cls
+    for cls in (Tissue, Bed, Tweezer, Programme, Procedure, Limits, Camera, Lights, Texture, Sensing, Declared)
 }
 FOLDER = Path(__file__).parent
 

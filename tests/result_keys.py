@@ -11,7 +11,11 @@ KEYS = {
     "noise": dict.fromkeys(("force_sd_ratio", "position_sd_ratio")),
     "calibration": dict.fromkeys(("nees_per_dof", "nees_attached", "coverage_90", "coverage_attached", "ece")),
     "tracking": {"rms_m": None},
-    "safety": dict.fromkeys(("limit_j", "max_mean_boundary_energy_j", "violations")),
+    "safety": dict.fromkeys(
+        ("limit_j", "max_mean_boundary_energy_j", "violations", "limit_n", "max_force_n", "force_violations")
+    ),
+    "ended": None,
+    "procedure": None,
     "entropy": dict.fromkeys(("prior", "final")),
     "frames": dict.fromkeys(("used", "skipped", "not_converged")),
     "timing": {

@@ -328,7 +328,7 @@ def test_a_belief_that_is_no_number_when_the_jaws_open_is_refused_and_the_last_o
     before, none = estimator.detection, jnp.full(sheet().n, jnp.nan)
     belief, no, yes = BoundaryBelief.prior(sheet().n, mean=0.0, sd=1.0), jnp.asarray(jnp.nan), jnp.asarray(True)
     spoilt = Stated(belief=belief, b=none, sd=none, probability=none, entropy=no, converged=yes)
-    monkeypatch.setattr(NonNegativeLeastSquares, "release", lambda self, belief: spoilt)
+    monkeypatch.setattr(NonNegativeLeastSquares, "release", lambda self, belief, thorough: spoilt)
     with pytest.raises(PerceptionError, match="leave no finite belief"):
         estimator.release()
     opened = dataclasses.replace(frames[4], tool=dataclasses.replace(frames[4].tool, closed=False))

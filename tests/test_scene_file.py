@@ -29,8 +29,18 @@ STIFFNESSES = {"arc_soft": 0.003, "arc": 1 / 30, "arc_stiff": 1.0, "arc_weld": n
 """Of an attached vertex, as a share of the membrane stiffness."""
 
 
-def test_the_shipped_scenes_are_the_ten_promised():
-    assert set(shipped_scenes()) == {*PAPER_COUNTS, *STIFFNESSES, "large_attach", "free"}
+PROCEDURES = {"detach": "large_attach", "suture": "line"}
+"""Scenes that a policy works on, and what they are otherwise."""
+
+
+def test_the_shipped_scenes_are_the_twelve_promised():
+    assert set(shipped_scenes()) == {*PAPER_COUNTS, *STIFFNESSES, *PROCEDURES, "large_attach", "free"}
+
+
+@pytest.mark.parametrize("name", sorted(PROCEDURES))
+def test_the_scenes_of_procedures_differ_in_their_policy_alone(name):
+    other = load_scene(PROCEDURES[name])
+    assert load_scene(name) == replace(other, name=name, programme=replace(other.programme, policy=name))
 
 
 @pytest.mark.parametrize("name", sorted(STIFFNESSES))

@@ -12,6 +12,7 @@ from result_keys import KEYS, keys
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.estimate_recording import EstimateWriter
+from jiggle_mj.limits import Limits
 from jiggle_mj.truth import Truth, TruthFrame
 from jiggle_mj.truth_recording import write_truth
 
@@ -61,7 +62,7 @@ TRUTH = Truth(
 )
 
 
-def unscored() -> dict:
+def unscored(limits: Limits | None = None) -> dict:
     return result(
         scene="by hand",
         seed=3,
@@ -74,12 +75,13 @@ def unscored() -> dict:
         prior_entropy=9.0,
         n_frames=5,
         skipped=[(1, "NaN in the pose")],
+        limits=limits,
     )
 
 
-def scored(**changes) -> dict:
+def scored(limits: Limits | None = None, **changes) -> dict:
     parts = {"sheet": SHEET, "estimates": ESTIMATES, "belief": BELIEF, "detection": DETECTION, "truth": TRUTH}
-    return with_truth(unscored(), **(parts | changes))
+    return with_truth(unscored(limits), **(parts | changes))
 
 
 def test_the_keys_are_those_of_the_contract_scored_or_not():
@@ -118,7 +120,26 @@ def test_the_truths_figures_by_hand():
         "ece": None,
     }
     assert figures["tracking"]["rms_m"] == pytest.approx(3e-4)
-    assert figures["safety"] == {"limit_j": None, "max_mean_boundary_energy_j": 0.0, "violations": None}
+    assert figures["safety"] == {
+        "limit_j": None,
+        "max_mean_boundary_energy_j": 0.0,
+        "violations": None,
+        "limit_n": None,
+        "max_force_n": None,
+        "force_violations": None,
+    }
+
+
+def test_frames_beyond_a_limit_are_counted():
+    """Two of six vertices at 0.8 N/m, moved by 0, 1 and 2 mm: 0, 1.3e-7 and 5.3e-7 J, and 0, 0.8 and 1.6 mN."""
+    frames = tuple(
+        replace(frame, positions=REST + np.array([0, 0, 1e-3 * k]), load=STIFFNESS * 1e-3 * k)
+        for k, frame in enumerate(TRUTH.frames)
+    )
+    safety = scored(truth=replace(TRUTH, frames=frames), limits=Limits(energy=3e-7, force=0.5e-3))["safety"]
+    assert safety["max_mean_boundary_energy_j"] == pytest.approx(0.8 * 4e-6 / 6)
+    assert safety["max_force_n"] == pytest.approx(1.6e-3)
+    assert (safety["violations"], safety["force_violations"]) == (1, 2)
 
 
 def test_a_tissue_without_attachments_has_no_recall_but_counts_reports():

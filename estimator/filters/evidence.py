@@ -92,8 +92,11 @@ class Filter(ABC):
             start: where a search for the state may begin [m].
         """
 
-    def release(self, belief: Any) -> Stated | None:
-        """Say that the jaws have opened; None where that changes nothing."""
+    def forget(self) -> None:  # noqa: B027  # most keep nothing
+        """Something was cut or sewn: take nothing again that was seen before."""
+
+    def release(self, belief: Any, *, thorough: bool = True) -> Stated | None:
+        """Say that the jaws have opened; None where that changes nothing. In passing if more grasps are to come."""
         return None
 
 

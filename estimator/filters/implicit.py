@@ -5,7 +5,7 @@ attachment shows only once its surroundings are believed stiff: when the jaws op
 what is believed now are linearised again, and replace what they said before. Nothing is counted twice.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -41,6 +41,8 @@ STALE = 0.1
 """A grasp is linearised again when some s has moved further than this from where it was."""
 FELT = 3e-3
 """The same, before the noise is judged by what a grasp leaves unexplained: the softest attachment's s."""
+SWEEPS = 10
+"""Over a belief after something was cut or sewn."""
 PASSES = 3
 """Over stale grasps, and over noises, at most, when the jaws open."""
 
@@ -52,8 +54,9 @@ class ImplicitFilter(Filter):
         """Take the sheet's balance of forces."""
         self._balance = balance
         self._grasps: list[_Grasp] = []
-        self._between = True
+        self._between, self._due = True, False
         self._noise = Noise()
+        self._kept: tuple[Any, Any] = 0.0, 0.0
 
     @property
     def noise(self) -> Noise:
@@ -65,8 +68,8 @@ class ImplicitFilter(Filter):
     ) -> Update:
         """See `Filter.update`."""
         s = belief.bounded(b)
-        balance, noisy = self._balance.widened(self._noise.force), evidence.widened(self._noise.position)
-        update, found = _update(balance, belief, s, noisy, start)
+        noisy = evidence.widened(self._noise.position)
+        update, found = _update(self.balance, belief, s, noisy, start)
         if np.isfinite(update.x).all() and np.isfinite(update.b).all():
             if self._between:
                 self._grasps.append(_Grasp())
@@ -74,12 +77,24 @@ class ImplicitFilter(Filter):
             self._between = False
         return update
 
-    def release(self, belief: AttachmentBelief) -> Stated | None:
-        """The belief with all grasps linearised again that need it; the next frame begins another grasp."""
-        if self._between:
+    def release(self, belief: AttachmentBelief, *, thorough: bool = True) -> Stated | None:
+        """The belief with all grasps linearised again that need it; the next frame begins another grasp.
+
+        In passing the noise is not judged, and propagation has to do in place of samples.
+        """
+        if self._between and not (thorough and self._due):
             return None
-        self._between = True
-        return self._judged(belief)
+        self._between, self._due = True, not thorough
+        return self._judged(belief) if thorough else self._settled(_swept(belief), STALE, 1, _swept)
+
+    def restart(self, belief: AttachmentBelief) -> Stated:
+        """Keep a belief as it is: no frame from before is judged again. The next one begins another grasp."""
+        self._between, self._grasps, self._kept = True, [], (belief.precision, belief.shift)
+        return _swept(belief)
+
+    def evidence(self) -> tuple[Float[Array, "n n"], Float[Array, " n"]] | None:
+        """What the frames since `restart`, or all frames, say of s, in information form; None before the first."""
+        return self._total() if self._grasps else None
 
     def of(self, belief: AttachmentBelief, energy: SheetEnergy) -> Stated:
         """All grasps so far judged again by another energy of the same sheet, the noise learned anew."""
@@ -93,12 +108,16 @@ class ImplicitFilter(Filter):
         """Of the sheet without attachments."""
         return self._balance.energy
 
+    @property
+    def balance(self) -> ForceBalance:
+        """Of forces, with the noise that was learned."""
+        return self._balance.widened(self._noise.force)
+
     def frames(self) -> Iterator[tuple[ForceBalance, Evidence, Float[Array, "n 3"]]]:
         """What was seen so far, with the noise that was learned, and the states found; by which balance."""
-        balance = self._balance.widened(self._noise.force)
         for grasp in self._grasps:
             for evidence, x, _ in grasp.frames:
-                yield balance, evidence.widened(self._noise.position), x
+                yield self.balance, evidence.widened(self._noise.position), x
 
     def _judged(self, belief: AttachmentBelief) -> Stated:
         stated = self._settled(_sampled(belief, PASSING), STALE, PASSES)
@@ -110,7 +129,9 @@ class ImplicitFilter(Filter):
             stated = self._settled(stated, STALE, PASSES)
         return _sampled(stated.belief, SAMPLES)
 
-    def _settled(self, stated: Stated, far: float, passes: int) -> Stated:
+    def _settled(
+        self, stated: Stated, far: float, passes: int, judge: Callable[[AttachmentBelief], Stated] | None = None
+    ) -> Stated:
         """After grasps that were linearised further than `far` from what is believed were linearised again."""
         for _ in range(passes):
             belief = stated.belief
@@ -123,9 +144,14 @@ class ImplicitFilter(Filter):
                 grasp.again(self._balance, s, self._noise) if old else grasp
                 for grasp, old in zip(self._grasps, stale, strict=True)
             ]
-            total = sum(grasp.precision for grasp in self._grasps), sum(grasp.shift for grasp in self._grasps)
-            stated = _sampled(eqx.tree_at(lambda one: (one.precision, one.shift), belief, total), PASSING)
+            total = tuple(kept + new for kept, new in zip(self._kept, self._total(), strict=True))
+            belief = eqx.tree_at(lambda one: (one.precision, one.shift), belief, total)
+            stated = _sampled(belief, PASSING) if judge is None else judge(belief)
         return stated
+
+    def _total(self) -> tuple[Any, Any]:
+        """What all grasps say together."""
+        return sum(grasp.precision for grasp in self._grasps), sum(grasp.shift for grasp in self._grasps)
 
     def _learned(self) -> Noise:
         return self._noise.learned([grasp.misfit for grasp in self._grasps if grasp.misfit is not None])
@@ -195,6 +221,13 @@ def _information(
     frame = balance.approach(x, s, evidence)
     fit = balance.fit(frame)
     return frame.x, balance.information(frame, fit), balance.misfit(frame, fit, evidence)
+
+
+@eqx.filter_jit
+def _swept(belief: AttachmentBelief) -> Stated:
+    for _ in range(SWEEPS):
+        belief = belief.sweep(belief.gaussian())
+    return _stated(belief, jnp.asarray(True))
 
 
 def _sampled(belief: Any, rounds: tuple[int, int]) -> Stated:

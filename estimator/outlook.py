@@ -1,0 +1,140 @@
+"""What a pull would show and what it would ask of the attachments, as far as the belief can tell.
+
+A belief is many tissues that could be: `scenarios` draws some of them. In each a pull ends in the equilibrium of the
+balance of forces, and what a look at it would add to the belief is known beforehand, as it depends on where the
+particles are, not on what is read off them:
+
+    1/2 ln det(I + Sigma^1/2 D^T N^-1 D Sigma^1/2)
+
+is what a Gaussian belief would gain. Ours is not Gaussian: a particle is free or attached, and a look that just tells
+the two apart teaches far more than its precision says. So the look is taken as one measurement of each particle's s, as
+precise as it makes what is known of it, and the gain is the expected fall of 1/2 ln of that s's variance, summed.
+
+An attachment that nobody knows of yet is in some scenarios and not in others: a risk as well as a hope. How stiff it
+may be, from hardly felt to a weld, would forbid every first pull; so it counts with at most a stiffness that somebody
+types, until more is expected of it.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.block_tridiagonal import lower_inverse
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.spike_and_slab import Mixture
+
+
+class Tug(eqx.Module):
+    """Tissue in the jaws, and where these take it; one, or many in arrays."""
+
+    start: Float[Array, "*many n 3"]
+    """Positions to search from [m]."""
+    held: Bool[Array, "*many n"]
+    loaded: Bool[Array, "*many n"]
+    """See `Evidence.loaded`."""
+    to: Float[Array, "*many n 3"]
+    """Where the held particles go [m]; meaningless for the others."""
+
+
+class Outcome(eqx.Module):
+    """Of a tug in one scenario; one, or many in arrays."""
+
+    x: Float[Array, "*many n 3"]
+    """[m]."""
+    gain: Float[Array, "*many"]
+    """What entropy is expected to fall by [nat]."""
+    energy: Float[Array, "*many"]
+    """Mean boundary energy [J]."""
+    force: Float[Array, "*many"]
+    """Largest on one attachment [N]."""
+
+
+class Outlook(eqx.Module):
+    """What is predicted from: the sheet's model, the belief, and how well a particle is seen."""
+
+    balance: ForceBalance
+    belief: AttachmentBelief
+    precision: Float[Array, "3 3"]
+    """Inverse covariance of a seen particle [1/m^2]."""
+
+    def scenarios(self, key: PRNGKeyArray, count: int, *, unknown: float | Array) -> Float[Array, "count n"]:
+        """Draws of s: free, or on which rung, for each particle by itself, then all s together given that.
+
+        None is stiffer than `unknown` [N/m], unless more is expected of it.
+        """
+        belief = self.belief
+        mixture = belief.mixture()
+        weight = mixture.weight
+        most = jnp.maximum(belief.bounded(jnp.asarray(unknown)[None]), mixture.moments()[0])
+        prior = belief.prior.stiffness
+        by_state, by_noise = jax.random.split(key)
+        log_weight = jnp.log(jnp.maximum(weight, 1e-300))[None]
+        states = jax.random.categorical(by_state, log_weight, axis=1, shape=(count, weight.shape[1]))
+        noise = jax.random.normal(by_noise, states.shape)
+
+        def one(state: Int[Array, " n"], noise: Float[Array, " n"]) -> Float[Array, " n"]:
+            precision = prior.sd[state] ** -2
+            factor = jnp.linalg.cholesky(belief.precision + jnp.diag(precision))
+            mean = jax.scipy.linalg.cho_solve((factor, True), belief.shift + prior.mean[state] * precision)
+            s = mean + jax.scipy.linalg.solve_triangular(factor.T, noise, lower=False)
+            return jnp.where(state > 0, jnp.clip(s, 0, most), 0.0)
+
+        return jax.lax.map(lambda drawn: one(*drawn), (states, noise))
+
+    def gain(self, precision: Float[Array, "n n"]) -> Float[Array, ""]:
+        """Expected fall of the belief's entropy by evidence about s of that precision [nat]."""
+        before, mixture = self.belief.precision + jnp.diag(self.belief.site_precision), self.belief.mixture()
+        known = jnp.sum(lower_inverse(jnp.linalg.cholesky(before)) ** 2, axis=0)
+        better = jnp.sum(lower_inverse(jnp.linalg.cholesky(before + precision)) ** 2, axis=0)
+        noise = 1 / jnp.maximum(1 / better - 1 / known, FAINT)
+        return jnp.sum(expected_fall(mixture, noise))
+
+    def outcome(self, tug: Tug, s: Float[Array, " n"], *, informative: bool = True) -> Outcome:
+        """Of a tug in a scenario; the gain costs as much as the rest, and is 0 where it is not asked for."""
+        balance, n = self.balance, len(s)
+        sight = jnp.broadcast_to(self.precision[None], (n, 3, 3))
+        grip = Evidence(y=tug.to, precision=sight, held=tug.held, loaded=tug.loaded)
+        x = balance.predict(jnp.where(tug.held[:, None], tug.to, tug.start), s, grip)
+        gain = jnp.zeros(())
+        if informative:
+            seen = eqx.tree_at(lambda one: one.y, grip, x)
+            frame = balance.linearise(x, s, seen)
+            gain = self.gain(balance.information(frame, balance.fit(frame)).precision)
+        b = balance.reference * s / (1 - s)
+        squared = jnp.sum((x - balance.energy.rest) ** 2, axis=1)
+        return Outcome(x=x, gain=gain, energy=0.5 * b @ squared / n, force=jnp.max(b * jnp.sqrt(squared)))
+
+
+def expected_fall(mixture: Mixture, noise: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Of 1/2 ln of each variable's variance, by one measurement with noise of the given variance.
+
+    The normals of the mixture are not cut off to [0, 1]; each is integrated over by Gauss-Hermite quadrature.
+    """
+    weight, mean, width = mixture.weight, mixture.mean, mixture.sd**2
+    node, share = (jnp.asarray(part) for part in np.polynomial.hermite_e.hermegauss(NODES))
+    total = width + noise[None]
+    log_weight = jnp.log(jnp.maximum(weight, 1e-300)) - 0.5 * jnp.log(total)
+
+    def after(read: Float[Array, " n"]) -> Float[Array, " n"]:
+        """1/2 ln of the variance left when that is read."""
+        told = jax.nn.softmax(log_weight - 0.5 * (read[None] - mean) ** 2 / total, axis=0)
+        return 0.5 * jnp.log(_variance(told, mean + width / total * (read[None] - mean), width * noise[None] / total))
+
+    reads = mean[None] + jnp.sqrt(total)[None] * node[:, None, None]
+    left = jax.vmap(jax.vmap(after))(reads)
+    expected = jnp.einsum("q,cn,qcn->n", share / jnp.sum(share), weight, left)
+    return 0.5 * jnp.log(_variance(weight, mean, width)) - expected
+
+
+def _variance(weight: Float[Array, "c n"], mean: Float[Array, "c n"], width: Float[Array, "c n"]) -> Float[Array, " n"]:
+    middle = jnp.sum(weight * mean, axis=0)
+    return jnp.sum(weight * (width + (mean - middle[None]) ** 2), axis=0)
+
+
+NODES = 5
+"""Of the quadrature over each normal of a mixture."""
+FAINT = 1e-6
+"""Least precision of a measurement."""

@@ -1,0 +1,273 @@
+"""Our policy: the pull, here or elsewhere, that is expected to teach most for each step, as far as it is safe.
+
+Each plan looks a few steps ahead from where the jaws are, in several directions, and at lifts from other places. While
+a grasp lasts, a place keeps its worth until it would be the best: what is learned mostly lowers it, so only the best
+are looked at again [lazy greedy: Minoux 1978, doi:10.1007/BFb0006528]. Letting go and grasping again costs `REGRASP`
+steps.
+
+Safe is a step after which, in the scenarios of the belief, neither the mean boundary energy nor the force on any
+attachment passes its limit with more than the allowed chance: their square root and it are taken as normal over the
+scenarios. Particles in the jaws and their neighbours, on which no force can be seen, are taken to be free: inside the
+sheet no place is grasped that is not known to be, and the first is on its edge.
+"""
+
+from itertools import product
+from statistics import NormalDist
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.estimator import Estimator
+from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.outlook import Outcome, Outlook, Tug
+from jiggle_mj.estimator.policies.policy import STEP, Policy
+from jiggle_mj.estimator.policies.workspace import bounds
+
+from jiggle_mj.limits import Limits
+from jiggle_mj.observation import Action, Grasp, Move, Release
+
+AHEAD = (3, 1)
+"""Steps that a pull is followed for, where the jaws are; fewer where that many are not allowed."""
+LIFTS = (1, 3, 6)
+"""Steps of the lifts that other places are judged by."""
+REGRASP = 3
+"""Steps that lowering, letting go and grasping again cost."""
+PLACES = 12
+"""Of grasps, spread over the sheet."""
+TRIED = 3
+"""Directions, best first, that are looked at for a safe one."""
+EXPECTED, JUDGED = 2, 16
+"""Scenarios that a gain is the mean of, and that a step's safety is judged by."""
+ENOUGH = 0.01
+"""A gain for which no step is worth taking [nat per particle]."""
+TIRED = 3
+"""Steps in a row that taught no more than that, after which a grasp is left, whatever the next promises: the model's
+error is the same where the tissue is the same, and another look from there says little new."""
+SHORTER = (1.0, 0.5)
+"""Shares of a step that are tried, where the whole is not safe."""
+DECIDED = 0.05
+"""P(attached) or P(free) of a particle about which enough is known."""
+KNOWN, SUSPECTED = 0.02, 0.2
+"""P(attached) up to which a place may be grasped, inside the sheet and on its edge."""
+LOST = 5e-3
+"""Slip from which the tissue is no longer in the jaws [m]."""
+_SLANT = 0.5**0.5
+DIRECTIONS = np.array(
+    [
+        [0, 0, 1],
+        *([x, y, 0] for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))),
+        *([_SLANT * x, _SLANT * y, _SLANT] for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))),
+    ],
+    dtype=float,
+)
+"""Up, along the sheet, and between."""
+
+
+class Information(Policy):
+    """Plans for one sheet."""
+
+    def __init__(self, limits: Limits, *, radius: float, seed: int, regrasps: bool = True) -> None:
+        """Say what is allowed.
+
+        Args:
+            limits: on the attachments, and on where the tip may go.
+            radius: of the jaws [m].
+            seed: draws the scenarios.
+            regrasps: whether to let go and grasp elsewhere; if not, the jaws are closed by somebody else.
+        """
+        super().__init__()
+        self.regrasps = regrasps
+        self._limits, self._radius, self._key = limits, radius, jax.random.key(seed)
+        self._worth: dict[int, float] = {}
+        self._place = -1
+        self._useless: set[int] = set()
+        self._leaving = self._over = ""
+        self._entropy: list[float] = []
+
+    def leave(self, why: str) -> None:
+        """Plan no more than what it takes to let go."""
+        self._over = why
+
+    def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
+        """See `Policy.plan`."""
+        estimator.begin()
+        with jax.enable_x64(True), one_thread():
+            hold, tool = estimator.hold, estimator.tool
+            outlook = estimator.outlook()
+            if hold is None or tool is None or not tool.closed:
+                return self._grasp(estimator, outlook) if self.regrasps else self._leaving or "nothing is grasped"
+            if estimator.slip > LOST:
+                self._leaving = f"the tissue has slipped out of the jaws by {1e3 * estimator.slip:.0f} mm"
+                return Release(), self._leaving
+            if self._leaving:
+                return Release(), self._leaving
+            self._entropy.append(float(outlook.belief.entropy()))
+            enough = ENOUGH * len(estimator.sheet.rest)
+            tired = len(self._entropy) > TIRED and self._entropy[-1 - TIRED] - self._entropy[-1] < TIRED * enough
+            found = None if self._over or tired else self._best_pull(estimator, outlook)
+            if self._over:
+                self._leaving = self._over
+            elif found is not None:
+                to, rate = found
+                elsewhere = self._best_place(estimator, outlook, above=rate) if self.regrasps else None
+                if rate >= enough and elsewhere is None:
+                    self._useless.clear()
+                    return Move(to=to), f"{rate:.0f} nat a step"
+                self._leaving = "another place teaches more" if elsewhere is not None else "little is left to learn"
+            else:
+                self._leaving = "nothing new is learned from here" if tired else "no pull from here is safe"
+            if not self.regrasps:
+                return self._leaving
+            if np.linalg.norm(tool.position - hold.tip) < STEP / 10:
+                self._useless |= {self._place} if len(self._entropy) == 1 else set()
+                return Release(), self._leaving
+            return Move(to=hold.tip), self._leaving
+
+    def _grasp(self, estimator: Estimator, outlook: Outlook) -> tuple[Action, str] | str:
+        self._leaving, self._entropy = "", []
+        if self._over:
+            return self._over
+        probability = np.asarray(outlook.belief.mixture().attached)
+        unsure = np.minimum(probability, 1 - probability) > DECIDED
+        if not unsure.any():
+            return f"enough is known: every P(attached) is below {DECIDED:g} or above {1 - DECIDED:g}"
+        enough, self._worth = ENOUGH * len(unsure), dict.fromkeys(self._worth, np.inf)
+        place = self._best_place(estimator, outlook, above=enough)
+        if place is None:
+            return f"no safe pull teaches {enough:.2g} nat a step; {int(unsure.sum())} of {len(unsure)} are not decided"
+        self._place = place
+        return Grasp(point=estimator.positions[place], radius=self._radius), f"{self._worth[place]:.0f} nat a step"
+
+    def _best_pull(self, estimator: Estimator, outlook: Outlook) -> tuple[Float[np.ndarray, " 3"], float] | None:
+        """Where the tip goes next, and what each step that way is expected to teach [nat]; None if nothing is safe."""
+        hold, tool = estimator.hold, estimator.tool
+        assert hold is not None and tool is not None
+        low, high = bounds(estimator, self._limits)
+        few, many = self._drawn(outlook)
+        start = estimator.positions
+
+        def tugs(tips: Float[np.ndarray, "k 3"]) -> Tug:
+            return self._tugs(estimator, hold.held, start, hold.closed_at + (tips - hold.tip)[:, None])
+
+        for ahead in AHEAD:
+            ends = tool.position + ahead * STEP * DIRECTIONS
+            inside = ((low <= ends) & (ends <= high)).all(axis=1)
+            rate = np.where(inside, self._allowed_gain(_outcomes(outlook, tugs(ends), few)).mean(axis=1) / ahead, 0.0)
+            best = [i for i in np.argsort(-rate)[:TRIED] if rate[i] > 0]
+            for share, i in product(SHORTER, best):
+                tip = tool.position + share * STEP * DIRECTIONS[i]
+                if self._safe(outlook, tugs(tip[None]), many):
+                    return tip, float(rate[i])
+        return None
+
+    def _best_place(self, estimator: Estimator, outlook: Outlook, *, above: float) -> int | None:
+        """The particle from which a lift teaches most for each step; None if that is not more than `above`."""
+        rest = estimator.sheet.rest
+        if not self._worth:
+            self._edge = SheetMesh(rest, estimator.sheet.faces).border
+            self._worth = dict.fromkeys(_spread(rest, PLACES).tolist(), np.inf)
+        probability = np.asarray(outlook.belief.mixture().attached)
+        few, many = self._drawn(outlook)
+        here = None if estimator.hold is None else estimator.hold.tip
+        fresh: set[int] = set()
+        while True:
+            best = max(self._worth, key=lambda place: self._worth[place])
+            if self._worth[best] <= above:
+                return None
+            held = np.linalg.norm(rest - rest[best], axis=1) <= self._radius
+            if best in fresh:
+                if self._safe(
+                    outlook, self._tugs(estimator, held, rest, rest[None] + STEP * DIRECTIONS[:1, None]), many
+                ):
+                    return best
+                self._worth[best] = 0.0
+                continue
+            fresh.add(best)
+            at_hand = best in self._useless or (here is not None and np.linalg.norm(rest[best] - here) < self._radius)
+            suspect = probability[estimator.loaded(held)].max() > (SUSPECTED if self._edge[best] else KNOWN)
+            self._worth[best] = 0.0 if at_hand or suspect else self._lifted(estimator, outlook, held, few)
+
+    def _lifted(
+        self, estimator: Estimator, outlook: Outlook, held: Bool[np.ndarray, " n"], few: Float[Array, "_few n"]
+    ) -> float:
+        """What each step of a lift is expected to teach [nat], letting go and grasping counted.
+
+        In each scenario the lift ends where it would no longer be allowed.
+        """
+        rest, heights = estimator.sheet.rest, STEP * np.array(LIFTS)
+        found = _outcomes(
+            outlook, self._tugs(estimator, held, rest, rest[None] + heights[:, None, None] * DIRECTIONS[0]), few
+        )
+        best = np.maximum.accumulate(self._allowed_gain(found), axis=0)
+        return float((best.mean(axis=1) / (REGRASP + np.array(LIFTS))).max())
+
+    def _tugs(
+        self,
+        estimator: Estimator,
+        held: Bool[np.ndarray, " n"],
+        start: Float[np.ndarray, "n 3"],
+        to: Float[np.ndarray, "k n 3"],
+    ) -> Tug:
+        """One grip taken to several places."""
+        parts = start, held, estimator.loaded(held)
+        start, held, loaded = (np.broadcast_to(part, (len(to), *part.shape)) for part in parts)
+        return Tug(start=jnp.asarray(start), held=jnp.asarray(held), loaded=jnp.asarray(loaded), to=jnp.asarray(to))
+
+    def _allowed_gain(self, found: Outcome) -> Float[np.ndarray, "k scenarios"]:
+        """Gains, 0 where a limit would be passed or nothing finite is predicted."""
+        allowed = (found.energy <= self._limits.energy) & (found.force <= self._limits.force)
+        return np.where(allowed, np.nan_to_num(found.gain), 0.0)
+
+    def _safe(self, outlook: Outlook, tug: Tug, many: Float[Array, "_many n"]) -> bool:
+        """Whether the chance to pass a limit is small enough, by what one tug does in all scenarios."""
+        found, far = _outcomes(outlook, tug, many, informative=False), NormalDist().inv_cdf(1 - self._limits.chance)
+        for values, limit in ((jnp.sqrt(found.energy), self._limits.energy**0.5), (found.force, self._limits.force)):
+            if not float(jnp.mean(values) + far * jnp.std(values)) <= limit:
+                return False
+        return True
+
+    def _drawn(self, outlook: Outlook) -> tuple[Float[Array, "few n"], Float[Array, "many n"]]:
+        self._key, one, other = jax.random.split(self._key, 3)
+        unknown = jnp.asarray(self._limits.unknown)
+        return _scenarios(outlook, one, EXPECTED, unknown), _scenarios(outlook, other, JUDGED, unknown)
+
+
+@eqx.filter_jit
+def _scenarios(outlook: Outlook, key: PRNGKeyArray, count: int, unknown: Float[Array, ""]) -> Float[Array, "count n"]:
+    return outlook.scenarios(key, count, unknown=unknown)
+
+
+def _outcomes(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
+    """Of each tug in each scenario: at once on a GPU, in turn on a CPU, where one compilation serves any number."""
+    if jax.default_backend() != "cpu":
+        return _at_once(outlook, tugs, s, informative=informative)
+    each_tug = [jax.tree.map(lambda leaf, i=i: leaf[i], tugs) for i in range(len(tugs.to))]
+    found = [[_outcome(outlook, tug, one, informative=informative) for one in s] for tug in each_tug]
+    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *row) for row in found]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked)
+
+
+@eqx.filter_jit
+def _outcome(outlook: Outlook, tug: Tug, s: Float[Array, " n"], *, informative: bool) -> Outcome:
+    return outlook.outcome(tug, jnp.where(tug.loaded, 0.0, s), informative=informative)
+
+
+@eqx.filter_jit
+def _at_once(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool) -> Outcome:
+    def one(tug: Tug) -> Outcome:
+        return jax.vmap(lambda s: _outcome(outlook, tug, s, informative=informative))(s)
+
+    return jax.vmap(one)(tugs)
+
+
+def _spread(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " _count"]:
+    """Indices of points far from one another, each the farthest from those before; begins far from the middle."""
+    chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)

@@ -1,0 +1,62 @@
+"""Who chooses the next action: a policy looks at the estimator, and says what the tool does.
+
+Its actions are a generator that goes on when the estimator has taken the observation of the action before. Ends when
+the policy is done, and then says why.
+"""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from jiggle_mj.estimator.estimator import Estimator
+
+from jiggle_mj.observation import Action
+
+STEP = 5e-3
+"""Gamma: longest way of the tip from one look at the tissue to the next, with tissue in the jaws [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decision:
+    """One action that was planned."""
+
+    action: Action
+    plan_s: float
+    """Wall time of the plan [s]."""
+    why: str
+    """In words."""
+
+
+class Policy(ABC):
+    """Plans action after action."""
+
+    def __init__(self) -> None:
+        """Nothing planned yet."""
+        self.decisions: list[Decision] = []
+        self.ended = "it was stopped"
+        """Why there are no more actions, once there are none."""
+
+    @abstractmethod
+    def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
+        """The next action, with words that say why; or, where there is none, why not.
+
+        Args:
+            estimator: after the latest observation.
+        """
+
+    def actions(self, estimator: Estimator, *, steps: int) -> Iterator[Action]:
+        """At most `steps` actions; an interrupted plan (Ctrl-C) is the end of them, and what was seen is kept."""
+        for _ in range(steps):
+            began = time.perf_counter()
+            try:
+                planned = self.plan(estimator)
+            except KeyboardInterrupt:
+                planned = "it was interrupted"
+            if isinstance(planned, str):
+                self.ended = planned
+                return
+            action, why = planned
+            self.decisions.append(Decision(action=action, plan_s=time.perf_counter() - began, why=why))
+            yield action
+        self.ended = f"all {steps} steps are done"

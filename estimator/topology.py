@@ -1,0 +1,78 @@
+"""Cuts and sutures as the belief takes them: what was meant is known, whether it worked is to be seen.
+
+The paper adds delta_b to the mean and W to the covariance. Here a particle of the region is free or attached with the
+odds that the act fails or holds, and what was seen of it before says nothing any more. Whether the act worked is asked
+of the region as a whole: the frames since then are likelier under one of two beliefs, that in which nothing has changed
+and that in which all of the region has become what was meant.
+"""
+
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+
+from jiggle_mj.observation import Cut, Suture
+from jiggle_mj.regions import distance_to_path
+
+FAILS = 0.1
+"""Chance that a cut or suture has not worked, before anything is seen of it."""
+SPIKE, SPREAD = 3e-4, 0.3
+"""Width of s where a cut has worked; of what a suture gives, relative to what was meant."""
+
+
+@dataclass(kw_only=True)
+class Change:
+    """One cut or suture, and what was believed before it."""
+
+    event: Cut | Suture
+    index: int
+    """Of the first observation after it."""
+    region: Bool[np.ndarray, " n"]
+    before: AttachmentBelief = field(repr=False)
+    evidence: tuple[Float[Array, "n n"], Float[Array, " n"]] | None = field(default=None, repr=False)
+    """What the frames until the next change said of s, in information form; None where there were none, or are yet."""
+
+    @property
+    def stiffness(self) -> float:
+        """What was meant for each particle of the region [N/m]."""
+        return self.event.stiffness if isinstance(self.event, Suture) else 0.0
+
+    def log_bayes_factor(self, precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> float:
+        """Ln p(evidence | it worked) / p(evidence | nothing changed), for evidence since then in information form.
+
+        Of a cut, worked means that all of the region is free; of a suture, that all of it holds as was meant.
+        """
+        meant = jnp.asarray(self.stiffness)
+        return float(_log_bayes_factor(self.before, jnp.asarray(self.region), meant, precision, shift))
+
+
+def region_of(event: Cut | Suture, rest: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Particles that a cut or suture is meant for; all False where it misses the sheet."""
+    return distance_to_path(rest[:, :2], np.asarray(event.path, dtype=float)) <= event.width / 2
+
+
+def after(belief: AttachmentBelief, event: Cut | Suture, region: Bool[np.ndarray, " n"]) -> AttachmentBelief:
+    """The belief right after a cut or suture; sweep it before asking."""
+    attached = belief.mixture().attached
+    chance = FAILS * attached if isinstance(event, Cut) else 1 - FAILS * (1 - attached)
+    return belief.changed(jnp.asarray(region), jnp.clip(chance, LEAST, 1 - LEAST))
+
+
+@eqx.filter_jit
+def _log_bayes_factor(
+    before: AttachmentBelief,
+    region: Bool[Array, " n"],
+    stiffness: Float[Array, ""],
+    precision: Float[Array, "n n"],
+    shift: Float[Array, " n"],
+) -> Float[Array, ""]:
+    meant = before.bounded(jnp.full(len(region), stiffness))
+    worked = before.fixed(region, meant, jnp.maximum(SPREAD * meant, SPIKE))
+    return worked.evidence_for(precision, shift) - before.evidence_for(precision, shift)
+
+
+LEAST = 1e-6
+"""No particle is surer to be free or attached after a cut or suture."""

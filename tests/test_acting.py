@@ -1,0 +1,181 @@
+"""Policies in closed loop with a small reference: what they do, what they keep to, and what they say at the end."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.estimator.policies.information import LOST, Information
+from jiggle_mj.estimator.policies.policy import STEP, Policy
+from jiggle_mj.eval.acting import actions, check_goes_with, most_actions, policy_named
+from jiggle_mj.eval.experiment import run_scene
+from jiggle_mj.scenes import Reference, load_scene
+from result_keys import KEYS, keys
+from tiny_scene import SCENE, call, scene_file
+
+from jiggle_mj.errors import OptionError
+from jiggle_mj.limits import Limits
+from jiggle_mj.observation import Declaration, Grasp, Move, Release, Wait
+from jiggle_mj.policies import POLICIES
+
+PAPERS = ("sl-d", "lg-d", "lg-h", "pmp-up", "pmp-left")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return load_scene(str(scene_file(tmp_path_factory.mktemp("scene"))))
+
+
+class Loop:
+    """A policy and a tissue, step by step."""
+
+    def __init__(self, scene, policy: Policy, *, steps: int):
+        with Reference(scene, seed=0, sensing="particles") as reference:
+            config = EstimatorConfig(judge_each_grasp=False)
+            self.estimator = Estimator(reference.declaration, reference.camera, config=config)
+            self.done, self.entropy = [], []
+            for action in actions(scene, policy, self.estimator, steps):
+                found = self.estimator.update(reference.step(action))
+                self.done.append(action)
+                self.entropy += [] if found is None else [found.entropy]
+
+
+@pytest.fixture(scope="module")
+def ours(scene) -> tuple[Policy, Loop]:
+    policy = policy_named("information", scene, seed=0)
+    assert policy is not None
+    return policy, Loop(scene, policy, steps=8)
+
+
+def test_ours_looks_grasps_and_pulls_in_steps_and_learns(ours):
+    policy, loop = ours
+    assert [type(action) for action in loop.done[:3]] == [Wait, Wait, Grasp]
+    tips = [
+        action.point if isinstance(action, Grasp) else action.to
+        for action in loop.done[2:]
+        if not isinstance(action, Release)
+    ]
+    moved = [np.linalg.norm(b - a) for a, b in pairwise(tips)]
+    assert moved[0] == pytest.approx(STEP)
+    assert len(policy.decisions) == 8 and policy.ended == "all 8 steps are done"
+    assert all(one.why and one.plan_s > 0 for one in policy.decisions)
+    assert loop.entropy[-1] < loop.entropy[0] < loop.estimator.prior_entropy
+
+
+def test_the_same_seed_plans_the_same(scene, ours):
+    again = policy_named("information", scene, seed=0)
+    assert again is not None
+    for old, new in zip(ours[1].done, Loop(scene, again, steps=4).done, strict=False):
+        assert type(old) is type(new)
+        if isinstance(new, Move):
+            np.testing.assert_array_equal(old.to, new.to)
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_the_papers_policies_move_the_grasp_that_they_are_given(scene, name):
+    policy = policy_named(name, scene, seed=0)
+    assert policy is not None
+    loop = Loop(scene, policy, steps=3)
+    assert sum(isinstance(action, Grasp) for action in loop.done) == 1
+    planned = [one.action for one in policy.decisions]
+    assert planned and all(isinstance(action, Move) for action in planned)
+    tips = [action.to for action in loop.done if isinstance(action, Move)]
+    assert max(np.linalg.norm(b - a) for a, b in pairwise(tips[-len(planned) - 1 :])) <= STEP + 1e-9
+
+
+def test_where_nothing_is_safe_nothing_is_grasped_and_it_says_so(scene):
+    policy = Information(Limits(force=1e-9, energy=1e-20), radius=8e-3, seed=0)
+    loop = Loop(scene, policy, steps=8)
+    assert not any(isinstance(action, Grasp) for action in loop.done)
+    assert policy.ended.startswith("no safe pull teaches 1.2 nat a step") and "not decided" in policy.ended
+
+
+def test_a_grasp_that_slipped_is_let_go(ours, monkeypatch):
+    _, loop = ours
+    if loop.estimator.hold is None:
+        pytest.fail("the last step of the run has tissue in the jaws")
+    monkeypatch.setattr(Estimator, "slip", property(lambda _: 2 * LOST))
+    fresh = Information(Limits(), radius=8e-3, seed=0)
+    action, why = fresh.plan(loop.estimator)
+    assert isinstance(action, Release) and "slipped out of the jaws by 10 mm" in why
+
+
+class Interrupted(Policy):
+    def plan(self, estimator):
+        if self.decisions:
+            raise KeyboardInterrupt
+        return Wait(), "to begin with"
+
+
+def test_an_interrupted_plan_is_the_end_of_the_run_not_of_the_results():
+    policy = Interrupted()
+    done = list(policy.actions(Estimator(Declaration()), steps=5))
+    assert len(done) == 1 and policy.ended == "it was interrupted"
+
+
+def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, monkeypatch, capsys):
+    path = scene_file(tmp_path, text=SCENE + "[limits]\nforce = 1e-5\n")
+    arguments = ("--sensing", "particles", "--policy", "pmp-up", "--steps", 3, "--json")
+    assert call(monkeypatch, "run", path, "--out", tmp_path / "out", *arguments) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert keys(figures) == KEYS
+    assert figures["policy"] == "pmp-up" and figures["ended"] == "all 3 steps are done"
+    assert figures["timing"]["plan_s"] > 0 and figures["safety"]["limit_n"] == 1e-5
+    safety = figures["safety"]
+    assert safety["force_violations"] > 0 and safety["max_force_n"] > 1e-5
+    assert (safety["violations"] > 0) == (safety["max_mean_boundary_energy_j"] > safety["limit_j"])
+    assert figures["procedure"] is None
+
+
+class Corners(Policy):
+    """Four corner lifts, wherever the corners lie, in place of looks that take minutes."""
+
+    def __init__(self):
+        super().__init__()
+        ways = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        self._left = [(way, height) for way in ways for height in (None, 0.01, 0.02, 0.03, 0.0, "open")]
+
+    def plan(self, estimator):
+        if not self._left:
+            return "enough was seen"
+        way, height = self._left.pop(0)
+        if height == "open":
+            return Release(), "the next"
+        if height is None:
+            corner = np.argmax(estimator.begin().rest[:, :2] @ np.array(way))
+            self._point = estimator.positions[corner]
+            return Grasp(point=self._point, radius=8e-3), "the next"
+        return Move(to=self._point + np.array([0, 0, height])), "higher"
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, monkeypatch, fails):
+    scene = load_scene(str(scene_file(tmp_path, text=SCENE + f"[procedure]\ncut_fails = {int(fails)}\n")))
+    monkeypatch.setattr("jiggle_mj.eval.acting.partial", lambda *_, **__: lambda: Corners())
+    figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="detach", steps=60)
+    done = figures["procedure"]
+    assert keys(figures) == KEYS | {"procedure": dict.fromkeys(("name", "cycles", "success", "acts"))}
+    assert done["name"] == "detach" and done["success"] is not fails
+    for act in done["acts"][:-1] if fails else done["acts"]:
+        assert act["kind"] == "cut" and act["succeeded"] is not fails
+        assert (act["log_bayes_factor"] > 0) is not fails
+    assert done["cycles"] == 1 or fails
+    assert figures["ended"].startswith("all 60 steps" if fails else "nothing is attached any more")
+
+
+def test_options_that_do_not_fit_are_refused(scene):
+    with pytest.raises(OptionError, match="policy = 'best': must be one of corners, information"):
+        policy_named("best", scene, seed=0)
+    with pytest.raises(OptionError, match="steps = 0: must be at least 1"):
+        most_actions(scene, "information", 0)
+    policy = policy_named("detach", scene, seed=0)
+    assert policy is not None
+    with pytest.raises(OptionError, match="plan with the filter 'implicit'; got 'adam'"):
+        check_goes_with(policy, replace(EstimatorConfig(), filter="adam"))
+
+
+def test_every_policy_has_a_length(scene):
+    assert {name: most_actions(scene, name, 7) > 7 for name in POLICIES} == dict.fromkeys(POLICIES, True)

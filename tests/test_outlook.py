@@ -1,0 +1,88 @@
+"""What is predicted of a pull: the gain against Monte Carlo, scenarios against the belief, loads by hand."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.outlook import Outlook, Tug, expected_fall
+from jiggle_mj.estimator.spike_and_slab import Mixture
+from small_sheet import GRIP_RADIUS, NOISE, attached, corners, sheet, sheet_balance, sheet_prior
+
+SIGHT = jnp.eye(3) / NOISE**2
+KNOWN = 0.09
+
+
+@pytest.fixture(scope="module")
+def outlook() -> Outlook:
+    """Half of the sheet was seen: the disc in the middle holds, and what surrounds it is free."""
+    belief, near = sheet_prior(), np.linalg.norm(sheet().rest, axis=1) < 20e-3
+    precision = jnp.diag(jnp.where(near, 5e-3**-2, 0.0))
+    belief = belief.add(precision, precision @ jnp.where(attached(), KNOWN, 0.0))
+    for _ in range(20):
+        belief = belief.sweep(belief.gaussian())
+    return Outlook(balance=sheet_balance(1e-4), belief=belief, precision=SIGHT)
+
+
+def lift(height: float) -> Tug:
+    held = np.linalg.norm(sheet().rest - corners()[0], axis=1) <= GRIP_RADIUS
+    rest, held = jnp.asarray(sheet().rest), jnp.asarray(held)
+    return Tug(start=rest, held=held, loaded=held, to=rest + jnp.array([[0.0, 0.0, height]]))
+
+
+def test_the_expected_fall_is_that_of_simulated_measurements():
+    """Of ln of the variance left, by drawing s and its measurement 20000 times and taking Bayes's rule on each."""
+    weight = np.array([[0.9, 0.2, 0.999], [0.06, 0.5, 5e-4], [0.04, 0.3, 5e-4]])
+    mean = np.array([[0.0, 0.0, 0.0], [0.03, 0.1, 0.05], [0.1, 0.4, 0.2]])
+    sd = np.array([[3e-4] * 3, [0.01, 0.03, 0.01], [0.03, 0.1, 0.05]])
+    noise = np.array([0.01, 0.2, 0.05]) ** 2
+    rng, draws = np.random.default_rng(0), 20_000
+    part = np.array([[rng.choice(3, p=weight[:, i]) for i in range(3)] for _ in range(draws)])
+    s = np.take_along_axis(mean, part, axis=0) + np.take_along_axis(sd, part, axis=0) * rng.normal(size=part.shape)
+    read = s + np.sqrt(noise) * rng.normal(size=s.shape)
+    total = sd**2 + noise
+    log = np.log(weight) - 0.5 * np.log(total) - 0.5 * (read[:, None] - mean) ** 2 / total
+    told = np.exp(log - log.max(axis=1, keepdims=True))
+    told /= told.sum(axis=1, keepdims=True)
+    centre, width = mean + sd**2 / total * (read[:, None] - mean), sd**2 * noise / total
+    middle = (told * centre).sum(axis=1)
+    left = (told * (width + (centre - middle[:, None]) ** 2)).sum(axis=1)
+    average = (weight * mean).sum(axis=0)
+    before = (weight * (sd**2 + (mean - average) ** 2)).sum(axis=0)
+    drawn = 0.5 * np.log(before) - 0.5 * np.log(left)
+    found = expected_fall(
+        Mixture(weight=jnp.asarray(weight), mean=jnp.asarray(mean), sd=jnp.asarray(sd)), jnp.asarray(noise)
+    )
+    np.testing.assert_allclose(found, drawn.mean(axis=0), atol=0.05)
+
+
+def test_a_look_that_tells_nothing_gains_nothing_and_a_sharper_one_more(outlook):
+    n = sheet().n
+    gains = [float(outlook.gain(precision * jnp.eye(n))) for precision in (0.0, 1e2, 1e4, 1e6)]
+    assert gains[0] == pytest.approx(0, abs=1e-4)
+    assert (np.diff(gains) > 0).all()
+
+
+def test_scenarios_are_the_belief_and_no_stiffer_where_nobody_knows(outlook):
+    s = outlook.scenarios(jax.random.key(0), 200, unknown=0.5)
+    mixture, inner = outlook.belief.mixture(), attached()
+    assert s.shape == (200, sheet().n) and (s >= 0).all()
+    np.testing.assert_allclose((s > 0).mean(axis=0), mixture.attached, atol=0.12)
+    np.testing.assert_allclose(s[:, inner].mean(axis=0), KNOWN, atol=0.01)
+    surely = mixture.attached > 0.5
+    assert s[:, ~surely].max() <= float(outlook.belief.bounded(jnp.array([0.5]))[0]) + 1e-12
+
+
+def test_a_pull_at_what_is_attached_loads_it_more_the_higher_it_goes(outlook):
+    s = jnp.where(attached(), KNOWN, 0.0)
+    low, high = (eqx.filter_jit(outlook.outcome)(lift(height), s) for height in (6e-3, 18e-3))
+    b = 30.0 * KNOWN / (1 - KNOWN)
+    away = np.linalg.norm(high.x - sheet().rest, axis=1)[attached()]
+    assert high.energy == pytest.approx(0.5 * b * (away**2).sum() / sheet().n)
+    assert high.force == pytest.approx(b * away.max())
+    assert high.energy > low.energy and high.force > low.force and high.gain > low.gain > 0
+
+
+def test_free_tissue_bears_nothing(outlook):
+    found = eqx.filter_jit(outlook.outcome)(lift(18e-3), jnp.zeros(sheet().n))
+    assert found.energy == 0 and found.force == 0 and found.gain > 0
