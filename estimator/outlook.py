@@ -12,7 +12,7 @@ precise as it makes what is known of it, and the gain is the expected fall of 1/
 
 An attachment that nobody knows of yet is in some scenarios and not in others: a risk as well as a hope. How stiff it
 may be, from hardly felt to a weld, would forbid every first pull; so it counts with at most a stiffness that somebody
-types, until more is expected of it.
+types, until it is likelier stiffer than not.
 """
 
 import equinox as eqx
@@ -63,12 +63,12 @@ class Outlook(eqx.Module):
     def scenarios(self, key: PRNGKeyArray, count: int, *, unknown: float | Array) -> Float[Array, "count n"]:
         """Draws of s: free, or on which rung, for each particle by itself, then all s together given that.
 
-        None is stiffer than `unknown` [N/m], unless more is expected of it.
+        None is stiffer than `unknown` [N/m], unless it is as likely above as below more.
         """
         belief = self.belief
         mixture = belief.mixture()
         weight = mixture.weight
-        most = jnp.maximum(belief.bounded(jnp.asarray(unknown)[None]), mixture.moments()[0])
+        most = jnp.maximum(belief.bounded(jnp.asarray(unknown)[None]), mixture.quantile(0.5))
         prior = belief.prior.stiffness
         by_state, by_noise = jax.random.split(key)
         log_weight = jnp.log(jnp.maximum(weight, 1e-300))[None]

@@ -55,10 +55,20 @@ def region_of(event: Cut | Suture, rest: Float[np.ndarray, "n 3"]) -> Bool[np.nd
 
 
 def after(belief: AttachmentBelief, event: Cut | Suture, region: Bool[np.ndarray, " n"]) -> AttachmentBelief:
-    """The belief right after a cut or suture; sweep it before asking."""
-    attached = belief.mixture().attached
-    chance = FAILS * attached if isinstance(event, Cut) else 1 - FAILS * (1 - attached)
-    return belief.changed(jnp.asarray(region), jnp.clip(chance, LEAST, 1 - LEAST))
+    """The belief right after a cut or suture; sweep it before asking.
+
+    What was sewn is about as stiff as was meant if it holds. That is said as one measurement of s, so wide that free is
+    not ruled out by it; what it says of free against attached is taken back from the odds.
+    """
+    attached, where = belief.mixture().attached, jnp.asarray(region)
+    if isinstance(event, Cut):
+        return belief.changed(where, jnp.clip(FAILS * attached, LEAST, 1 - LEAST))
+    changed = belief.changed(where, jnp.clip(1 - FAILS * (1 - attached), LEAST, 1 - LEAST))
+    meant = belief.bounded(jnp.full(len(region), event.stiffness))
+    odds = changed.prior.log_odds
+    _, factor = changed.prior.stiffness.posterior(meant, meant**2, odds)
+    changed = eqx.tree_at(lambda one: one.prior.log_odds, changed, jnp.where(where, odds - factor, odds))
+    return changed.add(jnp.diag(jnp.where(where, meant**-2, 0.0)), jnp.where(where, 1 / meant, 0.0))
 
 
 @eqx.filter_jit

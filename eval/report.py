@@ -164,6 +164,10 @@ def _payload(
         "faces": sheet.faces.T.tolist(),
         "series": _series(sheet, estimates, truth),
         "grasps": _grasps(estimates),
+        "paths": [
+            {"xyz": _fixed(path.T * 1e3, 2), "flat": _fixed(plane.flatten(path).T * 1e3, 2)}
+            for path in _paths(estimates)
+        ],
         "steps": [
             {
                 "frame": step,
@@ -257,6 +261,14 @@ def _grasps(estimates: Sequence[Estimate]) -> list[dict[str, int]]:
         else:
             runs.append({"first": step, "last": step})
     return runs
+
+
+def _paths(estimates: Sequence[Estimate]) -> list[np.ndarray]:
+    """Where the middle of what is held went in each grasp [m]."""
+    return [
+        np.array([one.positions[one.held].mean(axis=0) for one in estimates[grasp["first"] : grasp["last"] + 1]])
+        for grasp in _grasps(estimates)
+    ]
 
 
 def shown_steps(estimates: Sequence[Estimate], rest: np.ndarray) -> list[int]:

@@ -154,7 +154,7 @@ class Corners(Policy):
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, monkeypatch, fails):
     scene = load_scene(str(scene_file(tmp_path, text=SCENE + f"[procedure]\ncut_fails = {int(fails)}\n")))
-    monkeypatch.setattr("jiggle_mj.eval.acting.partial", lambda *_, **__: lambda: Corners())
+    monkeypatch.setattr("jiggle_mj.eval.acting.partial", lambda *_, **__: lambda **_: Corners())
     figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="detach", steps=60)
     done = figures["procedure"]
     assert keys(figures) == KEYS | {"procedure": dict.fromkeys(("name", "cycles", "success", "acts"))}

@@ -72,7 +72,9 @@ def test_after_a_cut_the_region_is_as_likely_attached_as_cuts_fail(belief):
 def test_after_a_suture_the_region_is_as_likely_attached_as_sutures_hold(belief):
     region = np.arange(N) >= 8
     sewn = swept(after(belief, Suture(path=CUT.path, width=1e-2, stiffness=1.0), region))
-    assert (sewn.mixture().attached[9:] > 1 - 2 * FAILS).all()
+    np.testing.assert_allclose(sewn.mixture().attached[9:], 1 - FAILS, atol=0.05)
+    meant = float(sewn.bounded(jnp.array([1.0]))[0])
+    np.testing.assert_allclose(sewn.posterior().mean[9:], meant, rtol=0.5)
     np.testing.assert_allclose(sewn.mixture().attached[:6], belief.mixture().attached[:6], atol=0.02)
 
 

@@ -3,7 +3,7 @@
 Each plan looks a few steps ahead from where the jaws are, in several directions, and at lifts from other places. While
 a grasp lasts, a place keeps its worth until it would be the best: what is learned mostly lowers it, so only the best
 are looked at again [lazy greedy: Minoux 1978, doi:10.1007/BFb0006528]. Letting go and grasping again costs `REGRASP`
-steps.
+steps. A place that taught less than it promised is promised that much less when it is thought of again.
 
 Safe is a step after which, in the scenarios of the belief, neither the mean boundary energy nor the force on any
 attachment passes its limit with more than the allowed chance: their square root and it are taken as normal over the
@@ -69,7 +69,9 @@ DIRECTIONS = np.array(
 class Information(Policy):
     """Plans for one sheet."""
 
-    def __init__(self, limits: Limits, *, radius: float, seed: int, regrasps: bool = True) -> None:
+    def __init__(
+        self, limits: Limits, *, radius: float, seed: int, regrasps: bool = True, enough: float = ENOUGH
+    ) -> None:
         """Say what is allowed.
 
         Args:
@@ -77,13 +79,15 @@ class Information(Policy):
             radius: of the jaws [m].
             seed: draws the scenarios.
             regrasps: whether to let go and grasp elsewhere; if not, the jaws are closed by somebody else.
+            enough: a gain for which no step is worth taking [nat per particle].
         """
         super().__init__()
-        self.regrasps = regrasps
+        self.regrasps, self._enough = regrasps, enough
         self._limits, self._radius, self._key = limits, radius, jax.random.key(seed)
         self._worth: dict[int, float] = {}
-        self._place = -1
-        self._useless: set[int] = set()
+        self._place: int | None = None
+        self._promised = np.inf
+        self._kept: dict[int, float] = {}
         self._leaving = self._over = ""
         self._entropy: list[float] = []
 
@@ -105,7 +109,7 @@ class Information(Policy):
             if self._leaving:
                 return Release(), self._leaving
             self._entropy.append(float(outlook.belief.entropy()))
-            enough = ENOUGH * len(estimator.sheet.rest)
+            enough = self._enough * len(estimator.sheet.rest)
             tired = len(self._entropy) > TIRED and self._entropy[-1 - TIRED] - self._entropy[-1] < TIRED * enough
             found = None if self._over or tired else self._best_pull(estimator, outlook)
             if self._over:
@@ -114,7 +118,6 @@ class Information(Policy):
                 to, rate = found
                 elsewhere = self._best_place(estimator, outlook, above=rate) if self.regrasps else None
                 if rate >= enough and elsewhere is None:
-                    self._useless.clear()
                     return Move(to=to), f"{rate:.0f} nat a step"
                 self._leaving = "another place teaches more" if elsewhere is not None else "little is left to learn"
             else:
@@ -122,23 +125,25 @@ class Information(Policy):
             if not self.regrasps:
                 return self._leaving
             if np.linalg.norm(tool.position - hold.tip) < STEP / 10:
-                self._useless |= {self._place} if len(self._entropy) == 1 else set()
                 return Release(), self._leaving
             return Move(to=hold.tip), self._leaving
 
     def _grasp(self, estimator: Estimator, outlook: Outlook) -> tuple[Action, str] | str:
-        self._leaving, self._entropy = "", []
+        if self._place is not None and self._entropy:
+            taught = (self._entropy[0] - self._entropy[-1]) / (len(self._entropy) - 1 + REGRASP)
+            self._kept[self._place] = float(np.clip(taught / self._promised, 0, 1))
+        self._leaving, self._entropy, self._place = "", [], None
         if self._over:
             return self._over
         probability = np.asarray(outlook.belief.mixture().attached)
         unsure = np.minimum(probability, 1 - probability) > DECIDED
         if not unsure.any():
             return f"enough is known: every P(attached) is below {DECIDED:g} or above {1 - DECIDED:g}"
-        enough, self._worth = ENOUGH * len(unsure), dict.fromkeys(self._worth, np.inf)
+        enough, self._worth = self._enough * len(unsure), dict.fromkeys(self._worth, np.inf)
         place = self._best_place(estimator, outlook, above=enough)
         if place is None:
             return f"no safe pull teaches {enough:.2g} nat a step; {int(unsure.sum())} of {len(unsure)} are not decided"
-        self._place = place
+        self._place, self._promised = place, self._worth[place]
         return Grasp(point=estimator.positions[place], radius=self._radius), f"{self._worth[place]:.0f} nat a step"
 
     def _best_pull(self, estimator: Estimator, outlook: Outlook) -> tuple[Float[np.ndarray, " 3"], float] | None:
@@ -186,9 +191,10 @@ class Information(Policy):
                 self._worth[best] = 0.0
                 continue
             fresh.add(best)
-            at_hand = best in self._useless or (here is not None and np.linalg.norm(rest[best] - here) < self._radius)
+            at_hand = here is not None and np.linalg.norm(rest[best] - here) < self._radius
             suspect = probability[estimator.loaded(held)].max() > (SUSPECTED if self._edge[best] else KNOWN)
             self._worth[best] = 0.0 if at_hand or suspect else self._lifted(estimator, outlook, held, few)
+            self._worth[best] *= self._kept.get(best, 1.0)
 
     def _lifted(
         self, estimator: Estimator, outlook: Outlook, held: Bool[np.ndarray, " n"], few: Float[Array, "_few n"]

@@ -17,6 +17,8 @@ from jiggle_mj.regions import distance_to_path
 
 CYCLE = 40
 """Most steps of looking before an act, and after the last."""
+CHECKED = 0.002
+"""A gain for which no step is worth taking once an act is to be checked [nat per particle]."""
 ROOM = 1.6
 """Width of a cut [spacings]: every particle on its path lies inside."""
 FREE = 0.2
@@ -28,8 +30,8 @@ class Procedure(Policy):
 
     name: str
 
-    def __init__(self, look: Callable[[], Information]) -> None:
-        """`look` makes a fresh policy for each time the tissue is looked at."""
+    def __init__(self, look: Callable[..., Information]) -> None:
+        """`look` makes a fresh policy for each time the tissue is looked at; may be told how much is `enough`."""
         super().__init__()
         self._fresh = look
         self._look, self._steps, self.acts = look(), 0, 0
@@ -47,7 +49,7 @@ class Procedure(Policy):
         if isinstance(act, str):
             return f"{act}; {planned}"
         self.acts += 1
-        self._look, self._steps = self._fresh(), 0
+        self._look, self._steps = self._fresh(enough=CHECKED), 0
         return act, planned
 
     def act(self, estimator: Estimator) -> Action | str:
@@ -74,7 +76,7 @@ class Sew(Procedure):
 
     name = "suture"
 
-    def __init__(self, look: Callable[[], Information], *, length: float, width: float, stiffness: float) -> None:
+    def __init__(self, look: Callable[..., Information], *, length: float, width: float, stiffness: float) -> None:
         """Of the stretch [m], and of each sewn particle's attachment [N/m]."""
         super().__init__(look)
         self._length, self._width, self._stiffness = length, width, stiffness
@@ -83,7 +85,9 @@ class Sew(Procedure):
         """See `Procedure.act`."""
         if self.acts:
             factor = estimator.worked(estimator.changes[-1])
-            return "the suture " + ("holds" if factor is not None and factor > 0 else "does not hold")
+            if factor is None:
+                return "whether the suture holds could not be seen"
+            return "the suture holds" if factor > 0 else "the suture does not hold"
         mesh, detection = SheetMesh(estimator.sheet.rest, estimator.sheet.faces), estimator.detection
         path = free_stretch(mesh.rest[:, :2], detection.score, mesh.border, length=self._length, width=self._width)
         if path is None:

@@ -1,7 +1,7 @@
 "use strict";
 (() => {
   const data = JSON.parse(document.getElementById("payload").textContent);
-  const { truth, series, grasps, steps, pictures } = data;
+  const { truth, series, grasps, steps, paths, pictures } = data;
   const colours = { seen: "#0072b2", unseen: "#e69f00", held: "#f0e442", ink: "#1d2733", soft: "#5b6875", red: "#d55e00", green: "#009e73" };
   const font = { family: 'system-ui, "Segoe UI", Roboto, Arial, sans-serif', size: 12, color: colours.ink };
   const still = { displaylogo: false, responsive: true, displayModeBar: false };
@@ -52,6 +52,8 @@
       text: chosen.map((i) => `b ${data.mean[i]} ± ${data.sd[i]} N/m${within(i)}<br>score ${data.score[i]}` + (truth ? `<br>b* ${star(i)}` : "")), hovertemplate: "%{text}<extra></extra>" };
   });
   if (border) dots.push(border(colours.ink, 1.3));
+  const pathColour = (k) => ["#cc79a7", "#e69f00", "#56b4e9", "#009e73"][k % 4];
+  paths.forEach(({ flat }, k) => dots.push({ type: "scatter", mode: "lines", x: flat[0], y: flat[1], line: { color: pathColour(k), width: 1.5 }, hoverinfo: "skip", showlegend: false }));
   Plotly.newPlot("map-detected", dots, { ...flatLayout, height: 306, margin: { ...flatLayout.margin, b: 48 } }, still);
   const glyphs = { circle: "●", "circle-open": "○", x: "✖" };
   dots.slice(0, kinds.length).forEach((dot) => {
@@ -110,7 +112,8 @@
   const colourBy = () => document.querySelector("input[name=colour]:checked").value;
   const state = { step: data.opening, playing: null };
   const shown = steps[state.step];
-  Plotly.newPlot("solid", [solid(data.faces, shown, shown.mean, scales.b, data.top_b, "mean b [N/m]")], solidLayout, config);
+  const ways = paths.map(({ xyz }, k) => ({ type: "scatter3d", mode: "lines", x: xyz[0], y: xyz[1], z: xyz[2], line: { color: pathColour(k), width: 5 }, hovertemplate: `grasp ${k + 1}<extra></extra>`, showlegend: false }));
+  Plotly.newPlot("solid", [solid(data.faces, shown, shown.mean, scales.b, data.top_b, "mean b [N/m]"), ...ways], solidLayout, config);
   const trueStep = (k) => { if (!truth) return null; for (let j = k; j >= 0; j--) if (truth.steps[j]) return truth.steps[j]; return truth.steps.find(Boolean) || null; };
   const drawsTruth = Boolean(truth && trueStep(state.step) && truth.faces.length && truth.faces[0].length);
   if (drawsTruth) {
@@ -158,7 +161,7 @@
     const grasp = grasps.findIndex((g) => g.first <= frame && frame <= g.last);
     document.getElementById("now").textContent = `frame ${series.index[frame]} · ${series.time[frame].toFixed(2)} s · ` + (grasp < 0 ? "nothing held" : `grasp ${grasp + 1}`);
     Plotly.restyle("solid", { x: [step.xyz[0]], y: [step.xyz[1]], z: [step.xyz[2]], intensity: [step[by]], colorscale: by === "mean" ? scales.b : scales.sd,
-      cmax: by === "mean" ? data.top_b : data.top_sd, "colorbar.title.text": by === "mean" ? "mean b [N/m]" : "sd of b [N/m]" });
+      cmax: by === "mean" ? data.top_b : data.top_sd, "colorbar.title.text": by === "mean" ? "mean b [N/m]" : "sd of b [N/m]" }, [0]);
     if (drawsTruth) { const now = trueStep(state.step); Plotly.restyle("solid-truth", { x: [now.xyz[0]], y: [now.xyz[1]], z: [now.xyz[2]], intensity: [now.b] }); }
     Plotly.relayout("curves", { [`shapes[${cursor}].x0`]: series.index[frame], [`shapes[${cursor}].x1`]: series.index[frame] });
     showPicture(frame);

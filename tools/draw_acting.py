@@ -1,0 +1,58 @@
+"""Draw docs/images/acting.webp from a run with images: what is believed in every frame, and the way of the grip.
+
+Run from the project's folder, after `jiggle-mj run arc --policy information --out out/acting`:
+.venv/bin/python tools/draw_acting.py out/acting
+"""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jiggle_mj.eval.carrying import carry
+
+from jiggle_mj.estimate_recording import read_estimate
+from jiggle_mj.recording import Recording
+from jiggle_mj.truth_recording import read_truth
+
+OUT = Path("docs/images/acting.webp")
+TOP = slice(40, 480), slice(0, 640)
+"""Rows and columns of the image that are shown."""
+PACE = 350
+"""Of a frame [ms]."""
+WHITE, BLACK, RED = (255, 255, 255), (0, 0, 0), (40, 40, 230)
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def frames(folder: Path) -> list[np.ndarray]:
+    """Left images with particles coloured by P(attached), the true attachments ringed, the grip's way drawn."""
+    recording, found = Recording.open(folder / "run.mcap"), read_estimate(folder / "estimate.mcap")
+    truth = carry(found.sheet, read_truth(folder / "run.truth.mcap"), found.estimates[0].index)
+    estimates, drawn, way = {one.index: one for one in found.estimates}, [], []
+    camera = recording.camera
+    assert camera is not None
+    for seen in recording:
+        if seen.images is None or seen.index not in estimates:
+            continue
+        one, image = estimates[seen.index], cv2.cvtColor(seen.images.left, cv2.COLOR_RGB2BGR)
+        pixel = camera.project(one.positions)[:, :2].round().astype(int)
+        way.append(pixel[one.held].mean(axis=0).round().astype(int))
+        level = (255 * np.clip(np.nan_to_num(one.probability), 0, 1)).astype(np.uint8)
+        colour = cv2.applyColorMap(level[:, None], cv2.COLORMAP_VIRIDIS)[:, 0]
+        for place, bgr, attached in zip(pixel.tolist(), colour.tolist(), truth.attached, strict=True):
+            cv2.circle(image, place, 3, bgr, -1, cv2.LINE_AA)
+            if attached:
+                cv2.circle(image, place, 5, WHITE, 1, cv2.LINE_AA)
+        cv2.polylines(image, [np.array(way)], False, RED, 2, cv2.LINE_AA)
+        for ink, width in ((BLACK, 3), (WHITE, 1)):
+            words = f"frame {seen.index}: entropy {one.entropy:.0f} nat"
+            cv2.putText(image, words, (10, TOP[0].start + 24), FONT, 0.6, ink, width, cv2.LINE_AA)
+        drawn.append(np.ascontiguousarray(image[TOP]))
+    return drawn
+
+
+if __name__ == "__main__":
+    animation = cv2.Animation()
+    animation.frames = frames(Path(sys.argv[1]))
+    animation.durations = [PACE] * (len(animation.frames) - 1) + [5 * PACE]
+    cv2.imwriteanimation(str(OUT), animation, [cv2.IMWRITE_WEBP_QUALITY, 60])
