@@ -153,7 +153,7 @@ def benchmark(sizes: tuple[int, ...], *, paper: bool, say: Callable[[str], None]
         metrics["peak_memory"] = {"value": peak_memory(), "unit": "GiB"}
         for n in [n for n in sizes if n <= LARGEST] if paper else []:
             say(f"n = {n}, the paper's controller")
-            _, seconds = timed(_sl_d(cases[n]), repeats=3)
+            _, seconds = timed(sl_d(cases[n]), repeats=3)
             metrics[f"plan_sl_d_n{n}_s"] = {"value": seconds, "unit": "s"}
     for part in ("equilibrium", "update", "plan_sl_d"):
         times = {n: float(metrics[f"{part}_n{n}_s"]["value"]) for n in sizes if f"{part}_n{n}_s" in metrics}
@@ -215,7 +215,7 @@ def _equilibrium(one: Case) -> Callable[[], object]:
     return lambda: search(one.gripped, one.b, one.before, force_tolerance=tolerance).x
 
 
-def _sl_d(one: Case) -> Callable[[], object]:
+def sl_d(one: Case) -> Callable[[], object]:
     """The search for one action, before the last frame, with a belief that is still the prior."""
     pull, held = one.frames[-1].pull, one.frames[-1].held
     assert pull is not None

@@ -328,7 +328,7 @@ def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = N
 
 
 def table(
-    name: Annotated[Literal["main", "active", "simulation", "one-lift"], tyro.conf.Positional],
+    name: Annotated[Literal["main", "active", "scalability", "simulation", "one-lift"], tyro.conf.Positional],
     /,
     *,
     out: Out,
@@ -339,8 +339,9 @@ def table(
     """Run a table of scenes and seeds, and print it as Markdown; what is in OUT already is not run again.
 
     Args:
-        name: main is the README's; active is the paper's comparison of policies, with ours; simulation and one-lift are
-            the paper's, with its printed figures and all baselines.
+        name: main is the README's; active is the paper's comparison of policies, with ours; scalability times their
+            plans at three sizes, on this machine; simulation and one-lift are the paper's, with its printed figures and
+            all baselines.
         out: holds a folder for each run, and of active the curves, active.html.
         seeds: of each row; 0 to 2 for main and 0 to 9 for the paper's if left out.
         sensing: of active; particles if left out.
@@ -370,6 +371,10 @@ def table(
         print(active_table.markdown(runs))
         active_table.write_curves(runs, out / active_table.FILE)
         console.print(f"curves: {out / active_table.FILE}")
+    elif name == "scalability":
+        from jiggle_mj.eval import scalability
+
+        print(scalability.markdown(scalability.scalability(scalability.SIZES, say=say)))
     else:
         table, cells = paper_tables.TABLES[name], paper_tables.cells()
         print(paper_tables.markdown(table, paper_tables.measure(table, cells, seeds or range(10), out, say=say)))

@@ -90,7 +90,7 @@ def test_where_nothing_is_safe_nothing_is_grasped_and_it_says_so(scene):
     policy = Information(Limits(force=1e-9, energy=1e-20), radius=8e-3, seed=0)
     loop = Loop(scene, policy, steps=8)
     assert not any(isinstance(action, Grasp) for action in loop.done)
-    assert policy.ended.startswith("no safe pull teaches 1.2 nat a step") and "not decided" in policy.ended
+    assert policy.ended.startswith("no safe pull teaches ") and "not decided" in policy.ended
 
 
 def test_a_grasp_that_slipped_is_let_go(ours, monkeypatch):

@@ -1,6 +1,7 @@
 """The page: whole without any part of its input, deterministic, closed to the network, and right in a real browser."""
 
 import dataclasses
+import json
 import re
 import shutil
 import subprocess
@@ -197,6 +198,27 @@ def test_each_combination_shows_what_it_has_and_nothing_else(tmp_path, truth, im
     assert "the right image is missing" in page
     assert "known relative to the declared membrane stiffness" in page
     assert "declaration.membrane_stiffness" in page
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_how_acting_ended_is_told_with_its_acts_and_the_way_of_the_grip_is_drawn(tmp_path, truth):
+    acts = [{"frame": 30, "kind": "cut", "log_bayes_factor": 12.3}]
+    run = synthetic()
+    figures = run["unscored"] | {"ended": "nothing is attached", "policy": "detach"}
+    figures["procedure"] = {"name": "detach", "cycles": 1, "success": None, "acts": acts}
+    parts = {name: run[name] for name in ("sheet", "estimates", "belief", "detection")}
+    if truth:
+        known = dataclasses.replace(run["truth"], details={"events": [{"succeeded": False}]})
+        parts["truth"], figures = known, with_truth(figures, **parts, truth=known)
+    write_report(tmp_path / "report.html", **parts, result=figures, settings=SETTINGS)
+    whole = (tmp_path / "report.html").read_text("utf-8")
+    page = own_markup(whole)
+    assert "planned no more because: nothing is attached" in page and ">12.3<" in page
+    assert ("it worked</th>" in page) == truth and ("<td>no</td>" in page) == truth
+    first = next(one for one in run["estimates"] if one.held.any())
+    held = first.positions[first.held].mean(axis=0) * 1e3
+    payload = json.loads(re.search(r'id="payload"[^>]*>(.*?)</script>', whole, flags=re.DOTALL).group(1))
+    assert np.allclose([axis[0] for axis in payload["paths"][0]["xyz"]], held, atol=0.01)
 
 
 def test_doubts_are_told_where_there_are_any(tmp_path):

@@ -41,7 +41,7 @@ TRIED = 3
 """Directions, best first, that are looked at for a safe one."""
 EXPECTED, JUDGED = 2, 16
 """Scenarios that a gain is the mean of, and that a step's safety is judged by."""
-ENOUGH = 0.01
+ENOUGH = 0.004
 """A gain for which no step is worth taking [nat per particle]."""
 TIRED = 3
 """Steps in a row that taught no more than that, after which a grasp is left, whatever the next promises: the model's
@@ -160,7 +160,7 @@ class Information(Policy):
         for ahead in AHEAD:
             ends = tool.position + ahead * STEP * DIRECTIONS
             inside = ((low <= ends) & (ends <= high)).all(axis=1)
-            rate = np.where(inside, self._allowed_gain(_outcomes(outlook, tugs(ends), few)).mean(axis=1) / ahead, 0.0)
+            rate = np.where(inside, self._allowed_gain(outcomes(outlook, tugs(ends), few)).mean(axis=1) / ahead, 0.0)
             best = [i for i in np.argsort(-rate)[:TRIED] if rate[i] > 0]
             for share, i in product(SHORTER, best):
                 tip = tool.position + share * STEP * DIRECTIONS[i]
@@ -204,7 +204,7 @@ class Information(Policy):
         In each scenario the lift ends where it would no longer be allowed.
         """
         rest, heights = estimator.sheet.rest, STEP * np.array(LIFTS)
-        found = _outcomes(
+        found = outcomes(
             outlook, self._tugs(estimator, held, rest, rest[None] + heights[:, None, None] * DIRECTIONS[0]), few
         )
         best = np.maximum.accumulate(self._allowed_gain(found), axis=0)
@@ -229,7 +229,7 @@ class Information(Policy):
 
     def _safe(self, outlook: Outlook, tug: Tug, many: Float[Array, "_many n"]) -> bool:
         """Whether the chance to pass a limit is small enough, by what one tug does in all scenarios."""
-        found, far = _outcomes(outlook, tug, many, informative=False), NormalDist().inv_cdf(1 - self._limits.chance)
+        found, far = outcomes(outlook, tug, many, informative=False), NormalDist().inv_cdf(1 - self._limits.chance)
         for values, limit in ((jnp.sqrt(found.energy), self._limits.energy**0.5), (found.force, self._limits.force)):
             if not float(jnp.mean(values) + far * jnp.std(values)) <= limit:
                 return False
@@ -246,7 +246,7 @@ def _scenarios(outlook: Outlook, key: PRNGKeyArray, count: int, unknown: Float[A
     return outlook.scenarios(key, count, unknown=unknown)
 
 
-def _outcomes(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
+def outcomes(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
     """Of each tug in each scenario: at once on a GPU, in turn on a CPU, where one compilation serves any number."""
     if jax.default_backend() != "cpu":
         return _at_once(outlook, tugs, s, informative=informative)
