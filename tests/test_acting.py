@@ -103,6 +103,13 @@ def test_a_grasp_that_slipped_is_let_go(ours, monkeypatch):
     assert isinstance(action, Release) and "slipped out of the jaws by 10 mm" in why
 
 
+def test_jaws_that_closed_unseen_are_opened(ours, monkeypatch):
+    _, loop = ours
+    monkeypatch.setattr(Estimator, "hold", property(lambda _: None))
+    action, why = Information(Limits(), radius=8e-3, seed=0).plan(loop.estimator)
+    assert isinstance(action, Release) and "no frame has shown" in why
+
+
 class Interrupted(Policy):
     def plan(self, estimator):
         if self.decisions:

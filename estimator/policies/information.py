@@ -101,8 +101,10 @@ class Information(Policy):
         with jax.enable_x64(True), one_thread():
             hold, tool = estimator.hold, estimator.tool
             outlook = estimator.outlook()
-            if hold is None or tool is None or not tool.closed:
+            if tool is None or not tool.closed:
                 return self._grasp(estimator, outlook) if self.regrasps else self._leaving or "nothing is grasped"
+            if hold is None:
+                return Release(), "no frame has shown what the jaws hold"
             if estimator.slip > LOST:
                 self._leaving = f"the tissue has slipped out of the jaws by {1e3 * estimator.slip:.0f} mm"
                 return Release(), self._leaving
