@@ -8,8 +8,8 @@ and has no fixed point to miss. To keep the form closed, the prior's normals are
 particle that is looked at a rung counts by the part of its s that would lie above 0. A model that errs may ask for less
 than nothing, which the widest rung would explain best.
 
-Between two particles that change their state nothing that the others depend on changes, so all are looked at together,
-and a sweep costs a rank-one update for each change; a few of them wait to be carried out together.
+Between two particles that change their state nothing that the others depend on changes, so the next few are looked at
+together, and a sweep costs a rank-one update for each change; a few of them wait to be carried out together.
 """
 
 import equinox as eqx
@@ -118,31 +118,36 @@ class Sampler(eqx.Module):
         n, centre, width = len(state), self.prior.stiffness.mean[:, None], self.prior.stiffness.sd[:, None] ** 2
         precision, shift = self._normals
         by_order, by_noise = jax.random.split(key)
-        turn, noise = jax.random.permutation(by_order, n), jax.random.gumbel(by_noise, (len(width), n))
+        order, noise = jnp.argsort(jax.random.permutation(by_order, n)), jax.random.gumbel(by_noise, (len(width), n))
+        order = jnp.append(order, jnp.full(AHEAD, n))
 
         def change(carried):
             state, mean, own, pending, weight, at = carried
-            apart = 1 / jnp.maximum(1 / own - precision[state], FAINT)[None]
-            told = apart * (mean / own - shift[state])[None]
+            some = jax.lax.dynamic_slice(order, (at,), (AHEAD,))
+            here, now = jnp.minimum(some, n - 1), state[jnp.minimum(some, n - 1)]
+            apart = 1 / jnp.maximum(1 / own[here] - precision[now], FAINT)[None]
+            told = apart * (mean[here] / own[here] - shift[now])[None]
             spread = apart + width
             above = log_ndtr(((told * width + centre * apart) / jnp.sqrt(spread * apart * width))[1:])
             attached = jnp.append(jnp.where(state > 0, 1.0, 0.0), 0.0)
-            odds = self.prior.log_odds + self.prior.coupling * jnp.sum(attached[self.prior.neighbours], axis=1)
+            beside = jnp.sum(attached[self.prior.neighbours[here]], axis=1)
+            odds = self.prior.log_odds[here] + self.prior.coupling * beside
             seen = -0.5 * (told - centre) ** 2 / spread - 0.5 * jnp.log(spread)
             log_weight = seen.at[1:].add(jnp.log(share)[:, None] + odds[None] + above)
-            drawn = jnp.argmax(log_weight + noise, axis=0)
-            waiting = jnp.where((drawn != state) & (turn >= at), turn, n)
-            i = jnp.argmin(waiting)
-            until = waiting[i]
-            new = jnp.where(until < n, drawn[i], state[i])
-            weight = jnp.where(((turn >= at) & (turn <= until))[None], jax.nn.softmax(log_weight, axis=0), weight)
+            drawn = jnp.argmax(log_weight + noise[:, here], axis=0)
+            changes = (drawn != now) & (some < n)
+            last = jnp.where(jnp.any(changes), jnp.argmax(changes), AHEAD - 1)
+            done = jnp.where(jnp.arange(AHEAD) <= last, some, n)
+            weight = weight.at[:, done].set(jax.nn.softmax(log_weight, axis=0), mode="drop")
+            i = here[last]
+            new = jnp.where(changes[last], drawn[last], state[i])
             stiffer, further = precision[new] - precision[state[i]], shift[new] - shift[state[i]]
             column = pending.column(i)
             factor = 1 / (1 + stiffer * column[i])
             mean = mean + factor * (further - stiffer * mean[i]) * column
             own = own - factor * stiffer * column**2
-            pending = pending.and_less(factor * stiffer, column)
-            return state.at[i].set(new), mean, own, pending, weight, until + 1
+            pending = pending.and_less(factor * stiffer, column, changes[last])
+            return state.at[i].set(new), mean, own, pending, weight, at + last + 1
 
         def batch(carried):
             state, moments, weight, at = carried
@@ -202,13 +207,13 @@ class Pending(eqx.Module):
         """The i-th, up to date."""
         return self.covariance[i] - (self.factors * self.columns[:, i]) @ self.columns
 
-    def and_less(self, factor: Float[Array, ""], column: Float[Array, " n"]) -> "Pending":
-        """After taking factor * column column^T away."""
+    def and_less(self, factor: Float[Array, ""], column: Float[Array, " n"], is_any: Bool[Array, ""]) -> "Pending":
+        """After taking factor * column column^T away; without any the factor is 0, and the next takes its place."""
         return Pending(
             covariance=self.covariance,
             columns=self.columns.at[self.count].set(column),
             factors=self.factors.at[self.count].set(factor),
-            count=self.count + 1,
+            count=self.count + is_any,
         )
 
     def done(self) -> Float[Array, "n n"]:
@@ -216,6 +221,8 @@ class Pending(eqx.Module):
         return self.covariance - (self.factors[:, None] * self.columns).T @ self.columns
 
 
+AHEAD = 16
+"""Particles that are looked at together for the next change."""
 PENDING = 32
 """Updates that wait for one another."""
 ROUND = 10

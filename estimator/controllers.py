@@ -13,6 +13,7 @@ prior. The paper states neither sigma, alpha, gamma nor the box that samples are
 """
 
 from collections.abc import Callable
+from typing import Self
 
 import equinox as eqx
 import jax
@@ -64,6 +65,18 @@ class Scales(eqx.Module):
     """U_max, of the mean boundary energy [J]."""
     noise: Float[Array, ""]
     """Standard deviation of an observed coordinate [m]."""
+
+    @classmethod
+    def at_prior(
+        cls, rest: Float[Array, "n 3"], covariance: Float[Array, "n n"], *, energy: float, noise: float
+    ) -> Self:
+        """Of a sheet at rest whose b has that covariance."""
+        lifted = rest + jnp.array([[0.0, 0.0, 0.01]])
+        return cls(
+            displacement=uncertainty_weighted_displacement(lifted, rest, covariance),
+            energy=jnp.asarray(energy),
+            noise=jnp.asarray(noise),
+        )
 
 
 def displacement_loss(simulator: XPBD, situation: Situation, scales: Scales) -> Loss:
@@ -153,7 +166,7 @@ def large_step(
         tip, _ = jax.lax.scan(one, tip, length=iterations)
         return tip, loss(tip)
 
-    tips, found = each(descended, tips)
+    tips, found = _each(descended, tips)
     found = jnp.where(jnp.isfinite(found), found, jnp.inf)
     order = jnp.argsort(found)
     return Samples(tips=tips[order], loss=found[order])
@@ -174,10 +187,10 @@ PRIMITIVES = {
 """The paper's motion primitives; down is forbidden, as the ground is there."""
 
 
-def each(function: Callable, inputs):
-    """Of every input along the leading axis: in turn on a CPU, which is faster there, and at once on a GPU."""
+def _each(function: Callable, tips: Float[Array, "k 3"]):
+    """Of every tip: in turn on a CPU, which is faster there, and at once on a GPU."""
     return jax.lax.platform_dependent(
-        inputs, cpu=lambda inputs: jax.lax.map(function, inputs), default=lambda inputs: jax.vmap(function)(inputs)
+        tips, cpu=lambda tips: jax.lax.map(function, tips), default=lambda tips: jax.vmap(function)(tips)
     )
 
 

@@ -26,7 +26,7 @@ from jiggle_mj.estimator.outlook import Outlook
 from jiggle_mj.estimator.perception import CloudTracker, Disparity, PointTracker, StereoTracker, TissueMask, Track
 from jiggle_mj.estimator.perception.cloud_tracker import lay_mesh
 from jiggle_mj.estimator.perception.mesh_field import MeshField
-from jiggle_mj.estimator.topology import Change, after, region_of
+from jiggle_mj.estimator.topology import Change, after, meant_by, region_of
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
@@ -150,10 +150,9 @@ class Estimator:
             ValueError: asked before `begin`, or of another filter than 'implicit'.
         """
         self._check_begun()
-        if not (isinstance(self._filter, ImplicitFilter) and isinstance(self._belief, AttachmentBelief)):
-            raise ValueError(f"only the filter 'implicit' predicts pulls; this one is {self.config.filter!r}.")
-        position = 1.0 if self._filter.noise is None else self._filter.noise.position
-        return Outlook(balance=self._filter.balance, belief=self._belief, precision=jnp.asarray(self._sight / position))
+        implicit, belief = self._implicit("predicts pulls")
+        position = 1.0 if implicit.noise is None else implicit.noise.position
+        return Outlook(balance=implicit.balance, belief=belief, precision=jnp.asarray(self._sight / position))
 
     @property
     def belief(self) -> Belief:
@@ -254,13 +253,11 @@ class Estimator:
             ValueError: asked before the first frame with closed jaws, or of another filter than 'implicit'.
         """
         self._check_begun()
-        if not (isinstance(self._filter, ImplicitFilter) and isinstance(self._belief, AttachmentBelief)):
-            raise ValueError(f"only the filter 'implicit' can identify the sheet; this one is {self.config.filter!r}.")
+        self._implicit("can identify the sheet")
         self.release()
+        implicit, belief = self._implicit("can identify the sheet")
         with jax.enable_x64(True), one_thread():
-            factors, log_sd, stated, converged = identify(
-                self._filter, self._belief, jnp.asarray(self._b), on_pass=on_pass
-            )
+            factors, log_sd, stated, converged = identify(implicit, belief, jnp.asarray(self._b), on_pass=on_pass)
             self._judge(stated)
         return material(self.declaration, factors, log_sd, converged=converged)
 
@@ -329,7 +326,7 @@ class Estimator:
             self._believe(self._filter.restart(after(self._belief, event, region)))
             return
         assert isinstance(self._belief, BoundaryBelief)
-        meant = event.stiffness if isinstance(event, Suture) else 0.0
+        meant = meant_by(event)
         change = jnp.where(region, meant - self._belief.mean(), 0.0)
         sd = max(self.config.prior_sd * self.declaration.membrane_stiffness, meant)
         self._belief = self._belief.predict(change, jnp.where(region, sd**2, 0.0))
@@ -341,13 +338,10 @@ class Estimator:
 
         Frames since the change and before the next are looked at.
         """
-        if not isinstance(self._filter, ImplicitFilter):
-            raise ValueError(f"only the filter 'implicit' can tell; this one is {self.config.filter!r}.")
-        evidence = change.evidence if change is not self.changes[-1] else self._filter.evidence()
-        if evidence is None:
-            return None
+        implicit, _ = self._implicit("can tell")
         with jax.enable_x64(True), one_thread():
-            return change.log_bayes_factor(*evidence)
+            evidence = change.evidence if change is not self.changes[-1] else implicit.evidence()
+            return None if evidence is None else change.log_bayes_factor(*evidence)
 
     def _believe(self, stated: Stated) -> None:
         self._belief, self._b, self._sd = stated.belief, np.asarray(stated.b), np.asarray(stated.sd)
@@ -362,6 +356,12 @@ class Estimator:
             )
         self._believe(stated)
         self._converged = bool(stated.converged)
+
+    def _implicit(self, does: str) -> tuple[ImplicitFilter, AttachmentBelief]:
+        """What only the filter 'implicit' does is done with these."""
+        if isinstance(self._filter, ImplicitFilter) and isinstance(self._belief, AttachmentBelief):
+            return self._filter, self._belief
+        raise ValueError(f"only the filter 'implicit' {does}; this one is {self.config.filter!r}.")
 
     def _check_begun(self) -> None:
         if self._filter is None:

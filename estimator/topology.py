@@ -13,14 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.filters.implicit import SPIKE, SPREAD
 
 from jiggle_mj.observation import Cut, Suture
 from jiggle_mj.regions import distance_to_path
 
 FAILS = 0.1
 """Chance that a cut or suture has not worked, before anything is seen of it."""
-SPIKE, SPREAD = 3e-4, 0.3
-"""Width of s where a cut has worked; of what a suture gives, relative to what was meant."""
 
 
 @dataclass(kw_only=True)
@@ -35,18 +34,18 @@ class Change:
     evidence: tuple[Float[Array, "n n"], Float[Array, " n"]] | None = field(default=None, repr=False)
     """What the frames until the next change said of s, in information form; None where there were none, or are yet."""
 
-    @property
-    def stiffness(self) -> float:
-        """What was meant for each particle of the region [N/m]."""
-        return self.event.stiffness if isinstance(self.event, Suture) else 0.0
-
     def log_bayes_factor(self, precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> float:
         """Ln p(evidence | it worked) / p(evidence | nothing changed), for evidence since then in information form.
 
         Of a cut, worked means that all of the region is free; of a suture, that all of it holds as was meant.
         """
-        meant = jnp.asarray(self.stiffness)
+        meant = jnp.asarray(meant_by(self.event))
         return float(_log_bayes_factor(self.before, jnp.asarray(self.region), meant, precision, shift))
+
+
+def meant_by(event: Cut | Suture) -> float:
+    """Stiffness that each particle of the region is to have [N/m]."""
+    return event.stiffness if isinstance(event, Suture) else 0.0
 
 
 def region_of(event: Cut | Suture, rest: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

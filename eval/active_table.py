@@ -19,9 +19,9 @@ from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.eval.carrying import CarriedTruth, carry
 from jiggle_mj.eval.experiment import run_scene
 from jiggle_mj.eval.metrics import dilate
-from jiggle_mj.eval.safety import borne
+from jiggle_mj.eval.safety import Borne, borne
 from jiggle_mj.eval.score import Json, read_result
-from jiggle_mj.eval.tables import carry_out, cell, finished
+from jiggle_mj.eval.tables import carry_out, cell, finished, value
 from jiggle_mj.scenes import load_scene
 from jiggle_mj.scenes.observer import Sensing
 from plotly.subplots import make_subplots
@@ -29,11 +29,12 @@ from plotly.subplots import make_subplots
 from jiggle_mj.episode import ESTIMATE, RECORDING, RESULT
 from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
 from jiggle_mj.mcap_files import truth_path
+from jiggle_mj.policies import POLICIES as ALL
 from jiggle_mj.policies import PolicyName
 from jiggle_mj.truth_recording import read_truth
 
 SCENES = ("arc", "line", "line_dot", "arc_line", "u_shape", "large_attach")
-PRIMITIVES: tuple[PolicyName, ...] = ("pmp-up", "pmp-forward", "pmp-backward", "pmp-left", "pmp-right")
+PRIMITIVES: tuple[PolicyName, ...] = tuple(name for name in ALL if name.startswith("pmp-"))
 POLICIES: tuple[PolicyName, ...] = ("information", "one-grasp", "sl-d", "lg-d", "lg-h", *PRIMITIVES)
 BEST = "PMP, best"
 """The primitive with the most entropy reduction in each run, as the paper gives it."""
@@ -52,10 +53,7 @@ class Course:
 
     fallen: Float[np.ndarray, " steps"]
     """By how much the entropy has fallen since the prior [nat]."""
-    energy: Float[np.ndarray, " steps"]
-    """True mean boundary energy [J]."""
-    force: Float[np.ndarray, " steps"]
-    """Largest on one attachment [N]."""
+    borne: Borne
     detected: Bool[np.ndarray, "steps n"]
     truth: CarriedTruth
     faces: np.ndarray
@@ -110,13 +108,11 @@ def course(directory: Path) -> Course:
     loads, by_index = borne(truth), {frame.index: k for k, frame in enumerate(truth.frames)}
     first = found.estimates[0].index
     rows = [by_index[min(first + k, truth.frames[-1].index)] for k in range(STEPS + 1)]
-    latest = _latest(found, first)
-    prior = figures["entropy"]
-    assert isinstance(prior, dict)
+    latest, prior = _latest(found, first), value(figures, ("entropy", "prior"))
+    assert prior is not None
     return Course(
-        fallen=float(prior["prior"]) - np.array([found.estimates[k].entropy for k in latest]),
-        energy=loads.energy[rows],
-        force=loads.force[rows],
+        fallen=prior - np.array([found.estimates[k].entropy for k in latest]),
+        borne=Borne(energy=loads.energy[rows], force=loads.force[rows]),
         detected=np.array([found.estimates[k].probability > 0.5 for k in latest]),
         truth=carry(found.sheet, truth, truth.frames[-1].index),
         faces=found.sheet.faces,
@@ -144,17 +140,16 @@ def knowable(runs: Runs) -> dict[tuple[str, int], Bool[np.ndarray, " n"]]:
     """Attachments that some run within the limits loaded enough to show, by scene and seed."""
     found: dict[tuple[str, int], Bool[np.ndarray, " n"]] = {}
     for (scene, _, seed), run in runs.items():
-        within = not (violations(run) or run.truth.observable is None)
+        within = not (beyond(run).any() or run.truth.observable is None)
         loaded = run.truth.observable if within else np.zeros_like(run.truth.attached)
         found[scene, seed] = found.get((scene, seed), np.zeros_like(run.truth.attached)) | loaded
     return found
 
 
-def violations(run: Course) -> int:
-    """Frames beyond the limit on the energy or that on a force."""
-    safety = run.result["safety"]
-    assert isinstance(safety, dict)
-    return int(((run.energy > safety["limit_j"]) | (run.force > safety["limit_n"])).sum())
+def beyond(run: Course) -> Bool[np.ndarray, " steps"]:
+    """Steps beyond the limit on the energy or that on a force."""
+    energy, force = (value(run.result, ("safety", limit)) for limit in ("limit_j", "limit_n"))
+    return run.borne.passed(energy=energy, force=force)
 
 
 def steps_until(run: Course, known: Bool[np.ndarray, " n"]) -> int | None:
@@ -177,15 +172,14 @@ def markdown(runs: Runs) -> str:
     for scene, policy in dict.fromkeys((scene, policy) for scene, policy, _ in runs):
         mine = {seed: runs[scene, policy, seed] for seed in seeds if (scene, policy, seed) in runs}
         until = [steps_until(run, known[scene, seed]) for seed, run in mine.items()]
-        plans = [_plan_s(run) for run in mine.values()]
         cells = [cell([float(run.fallen[mark]) for run in mine.values()], 1.0, 0) for mark in MARKS]
         cells += [
-            cell([float(np.nanmax(run.energy)) for run in mine.values()], 1e9, 2),
-            cell([float(np.nanmax(run.force)) for run in mine.values()], 1e3, 1),
-            f"{sum(violations(run) > 0 for run in mine.values())} of {len(mine)}",
+            cell([run.borne.most[0] for run in mine.values()], 1e9, 2),
+            cell([run.borne.most[1] for run in mine.values()], 1e3, 1),
+            f"{sum(beyond(run).any() for run in mine.values())} of {len(mine)}",
             f"{cell([None if one is None else float(one) for one in until], 1.0, 0)}"
             f" ({sum(one is not None for one in until)} of {len(until)})",
-            cell(plans, 1.0, 1),
+            cell([value(run.result, ("timing", "plan_s")) for run in mine.values()], 1.0, 1),
         ]
         lines.append(f"| {scene} | {policy} | " + " | ".join(cells) + " |")
     return "\n".join([*lines, "", *beside(runs, known)])
@@ -200,11 +194,12 @@ def beside(runs: Runs, known: Mapping[tuple[str, int], Bool[np.ndarray, " n"]]) 
     ]
     if not pairs:
         return []
-    ratio = np.array([ours.fallen[-1] / theirs.fallen[-1] for _, ours, theirs in pairs])
-    said = [
-        f"Entropy fallen after {STEPS} steps, {OURS} over {THEIRS}: {ratio.mean():.2f} "
-        f"({ratio.min():.2f}…{ratio.max():.2f}) in {len(pairs)} runs."
-    ]
+    after = {f"after {STEPS} steps": [STEPS] * len(pairs)}
+    after["for as long as both were within the limits"] = [_within(ours, theirs) for _, ours, theirs in pairs]
+    said = []
+    for when, steps in after.items():
+        ratio = [ours.fallen[k] / theirs.fallen[k] for (_, ours, theirs), k in zip(pairs, steps, strict=True)]
+        said.append(f"Entropy fallen {when}, {OURS} over {THEIRS}: {cell(ratio, 1.0, 2)} in {len(pairs)} runs.")
     ours = [steps_until(run, known[scene, seed]) for (scene, _, seed), run, _ in pairs]
     theirs = [steps_until(run, known[scene, seed]) for (scene, _, seed), _, run in pairs]
     both = [(a, b) for a, b in zip(ours, theirs, strict=True) if a is not None and b is not None]
@@ -214,6 +209,12 @@ def beside(runs: Runs, known: Mapping[tuple[str, int], Bool[np.ndarray, " n"]]) 
         words += f"; in the {len(both)} of both after {np.mean([a for a, _ in both]):.0f} steps against "
         words += f"{np.mean([b for _, b in both]):.0f}"
     return [*said, words + "."]
+
+
+def _within(*runs: Course) -> int:
+    """The last step before the first at which one is beyond a limit."""
+    passed = np.flatnonzero(np.any([beyond(run) for run in runs], axis=0))
+    return STEPS if not len(passed) else max(int(passed[0]) - 1, 0)
 
 
 def write_curves(runs: Runs, path: Path) -> None:
@@ -226,7 +227,7 @@ def write_curves(runs: Runs, path: Path) -> None:
     step = np.arange(STEPS + 1)
     for (scene, policy), colour in ((key, colours[key[1]]) for key in dict.fromkeys(key[:2] for key in runs)):
         mine, row = [run for key, run in runs.items() if key[:2] == (scene, policy)], 1 + scenes.index(scene)
-        for column, rows in enumerate(([run.fallen for run in mine], [run.energy for run in mine]), start=1):
+        for column, rows in enumerate(([run.fallen for run in mine], [run.borne.energy for run in mine]), start=1):
             for one in rows:
                 line = go.Scatter(x=step, y=one, line={"color": colour, "width": 0.7}, opacity=0.5, showlegend=False)
                 figure.add_trace(line, row=row, col=column)
@@ -236,19 +237,12 @@ def write_curves(runs: Runs, path: Path) -> None:
             figure.add_trace(mean, row=row, col=column)
         figure.update_yaxes(type="log", row=row, col=2)
     for row, scene in enumerate(scenes, start=1):
-        safety = next(run for key, run in runs.items() if key[0] == scene).result["safety"]
-        assert isinstance(safety, dict)
-        limit = go.Scatter(x=step[[0, -1]], y=[safety["limit_j"]] * 2, line={"dash": "dot", "color": "black"},
+        allowed = value(next(run for key, run in runs.items() if key[0] == scene).result, ("safety", "limit_j"))
+        limit = go.Scatter(x=step[[0, -1]], y=[allowed] * 2, line={"dash": "dot", "color": "black"},
                            name="limit", showlegend=row == 1)  # fmt: skip
         figure.add_trace(limit, row=row, col=2)
     figure.update_layout(height=330 * len(scenes), template="plotly_white", title="Policies, step by step")
     figure.write_html(path, include_plotlyjs=True, div_id="active")
-
-
-def _plan_s(run: Course) -> float | None:
-    timing = run.result["timing"]
-    assert isinstance(timing, dict)
-    return None if timing["plan_s"] is None else float(str(timing["plan_s"]))
 
 
 COLOURS = ("#d55e00", "#cc79a7", "#0072b2", "#56b4e9", "#009e73", "#e69f00")

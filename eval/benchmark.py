@@ -29,7 +29,6 @@ from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
 from jiggle_mj.estimator.filters.shots import simulator
 from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.objectives import uncertainty_weighted_displacement
 from jiggle_mj.estimator.surrogate import surrogate
 
 from jiggle_mj.observation import Declaration
@@ -220,12 +219,7 @@ def sl_d(one: Case) -> Callable[[], object]:
     pull, held = one.frames[-1].pull, one.frames[-1].held
     assert pull is not None
     f, covariance = simulator(one.mesh, one.declaration), 0.1 * STIFFNESS**2 * jnp.eye(one.mesh.n)
-    lifted = f.rest + jnp.array([[0.0, 0.0, 0.01]])
-    scales = Scales(
-        displacement=uncertainty_weighted_displacement(lifted, f.rest, covariance),
-        energy=jnp.asarray(1e-6),
-        noise=jnp.asarray(NOISE),
-    )
+    scales = Scales.at_prior(f.rest, covariance, energy=1e-6, noise=NOISE)
     situation = Situation(
         x=pull.before,
         tip=pull.tip,

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from jiggle_mj.eval.carrying import stiffness_at
 
 from jiggle_mj.truth import Truth
@@ -26,14 +26,18 @@ class Borne:
         )
         return energy, force
 
-    def violations(self, *, energy: float | None = None, force: float | None = None) -> int:
+    def passed(self, *, energy: float | None = None, force: float | None = None) -> Bool[np.ndarray, " t"]:
         """Frames in which one of the limits that are given is passed."""
         passed = np.zeros(len(self.energy), dtype=bool)
         if energy is not None:
             passed |= self.energy > energy
         if force is not None:
             passed |= self.force > force
-        return int(passed.sum())
+        return passed
+
+    def violations(self, *, energy: float | None = None, force: float | None = None) -> int:
+        """How many frames those are."""
+        return int(self.passed(energy=energy, force=force).sum())
 
 
 def borne(truth: Truth) -> Borne:

@@ -328,7 +328,7 @@ def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = N
 
 
 def table(
-    name: Annotated[Literal["main", "active", "scalability", "simulation", "one-lift"], tyro.conf.Positional],
+    name: Annotated[Literal["main", "active", "acts", "scalability", "simulation", "one-lift"], tyro.conf.Positional],
     /,
     *,
     out: Out,
@@ -339,25 +339,29 @@ def table(
     """Run a table of scenes and seeds, and print it as Markdown; what is in OUT already is not run again.
 
     Args:
-        name: main is the README's; active is the paper's comparison of policies, with ours; scalability times their
-            plans at three sizes, on this machine; simulation and one-lift are the paper's, with its printed figures and
-            all baselines.
+        name: main is the README's; active is the paper's comparison of policies, with ours; acts is whether failed cuts
+            and sutures are noticed; scalability times plans at three sizes, on this machine; simulation and one-lift
+            are the paper's, with its printed figures and all baselines.
         out: holds a folder for each run, and of active the curves, active.html.
-        seeds: of each row; 0 to 2 for main and 0 to 9 for the paper's if left out.
+        seeds: of each row; 0 to 2 for main, 0 to 5 for acts and 0 to 9 for the paper's if left out.
         sensing: of active; particles if left out.
-        jobs: of active: how many runs at a time; as many as there are usable cores if left out.
+        jobs: of active and acts: how many runs at a time; as many as there are usable cores if left out.
     """
-    from jiggle_mj.eval import active_table, paper_tables, tables
-    from jiggle_mj.worker_processes import WorkerProcesses
+    from jiggle_mj.eval import paper_tables, tables
 
     def say(text: str) -> None:
         console.print(text, highlight=False)
 
-    if name != "active" and (sensing is not None or jobs is not None):
-        raise OptionError(f"--{'jobs' if sensing is None else 'sensing'} is for the table active; got {name}.")
+    if sensing is not None and name != "active":
+        raise OptionError(f"--sensing is for the table active; got {name}.")
+    if jobs is not None and name not in ("active", "acts"):
+        raise OptionError(f"--jobs is for the tables active and acts; got {name}.")
     if name == "main":
         print(tables.markdown(tables.measure(tables.MAIN, seeds or range(3), out, say=say)))
     elif name == "active":
+        from jiggle_mj.eval import active_table
+        from jiggle_mj.worker_processes import WorkerProcesses
+
         with WorkerProcesses(jobs) as executor:
             runs = active_table.measure(
                 active_table.SCENES,
@@ -371,6 +375,13 @@ def table(
         print(active_table.markdown(runs))
         active_table.write_curves(runs, out / active_table.FILE)
         console.print(f"curves: {out / active_table.FILE}")
+    elif name == "acts":
+        from jiggle_mj.eval import acts_table
+        from jiggle_mj.worker_processes import WorkerProcesses
+
+        with WorkerProcesses(jobs) as executor:
+            found = acts_table.measure(acts_table.SCENES, seeds or range(6), out, executor=executor, say=say)
+        print(acts_table.markdown(found))
     elif name == "scalability":
         from jiggle_mj.eval import scalability
 

@@ -8,6 +8,7 @@ import pytest
 from jiggle_mj.eval import active_table
 from jiggle_mj.eval.active_table import BEST, STEPS, Course, knowable, markdown, steps_until, with_best, write_curves
 from jiggle_mj.eval.carrying import CarriedTruth
+from jiggle_mj.eval.safety import Borne
 from jiggle_mj.eval.tables import carry_out
 
 FACES = np.array([[k, k + 1, k + 2] for k in range(8)])
@@ -20,8 +21,7 @@ def course(total: float, *, energy: float = 1e-9, found_after: int = 5, load: fl
     detected[found_after:] = ATTACHED
     return Course(
         fallen=np.linspace(0, total, STEPS + 1),
-        energy=np.full(STEPS + 1, energy),
-        force=np.full(STEPS + 1, 1e-3),
+        borne=Borne(energy=np.full(STEPS + 1, energy), force=np.full(STEPS + 1, 1e-3)),
         detected=detected,
         truth=CarriedTruth(attached=ATTACHED, stiffness=1.0 * ATTACHED, load=load * ATTACHED),
         faces=FACES,
@@ -59,11 +59,19 @@ def test_ours_stands_beside_theirs_in_words_and_violations_are_counted():
         ("arc", "pmp-up", 0): course(120.0, energy=1e-6),
     }
     text = markdown(runs)
-    assert "information over sl-d: 1.50 (1.50…1.50) in 1 runs" in text
+    assert "after 40 steps, information over sl-d: 1.50 in 1 runs" in text
     assert "found by information in 1 of 1 runs, by sl-d in 1; in the 1 of both after 6 steps against 12" in text
     (ours,) = [line for line in text.splitlines() if line.startswith("| arc | information")]
     (torn,) = [line for line in text.splitlines() if line.startswith(f"| arc | {BEST}")]
     assert "0 of 1" in ours and "1 of 1" in torn and "6 (1 of 1)" in ours
+
+
+def test_while_both_are_within_the_limits_only_those_steps_count():
+    theirs = course(100.0)
+    theirs.borne.energy[21:] = 1e-6
+    late = replace(theirs, fallen=np.concatenate([np.full(21, 20.0), np.full(STEPS - 20, 100.0)]))
+    text = markdown({("arc", "information", 0): course(150.0), ("arc", "sl-d", 0): late})
+    assert "within the limits, information over sl-d: 3.75 in 1 runs" in text
 
 
 def test_the_curves_are_the_same_bytes_twice(tmp_path):

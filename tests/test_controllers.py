@@ -19,7 +19,6 @@ from jiggle_mj.estimator.controllers import (
 )
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.filters.shots import simulator
-from jiggle_mj.estimator.objectives import uncertainty_weighted_displacement
 from small_sheet import STIFFNESS, attached, sheet
 
 from jiggle_mj.observation import Declaration
@@ -44,13 +43,7 @@ def problem():
         b=jnp.asarray(np.where(attached(), STIFFNESS, 1e-4)),
         covariance=covariance,
     )
-    lifted = f.rest + jnp.array([[0.0, 0.0, 0.01]])
-    scales = Scales(
-        displacement=uncertainty_weighted_displacement(lifted, f.rest, covariance),
-        energy=jnp.asarray(1e-6),
-        noise=jnp.asarray(2e-4),
-    )
-    return f, situation, scales
+    return f, situation, Scales.at_prior(f.rest, covariance, energy=1e-6, noise=2e-4)
 
 
 @pytest.mark.parametrize("kind", [displacement_loss, entropy_loss])

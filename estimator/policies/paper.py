@@ -28,7 +28,6 @@ from jiggle_mj.estimator.controllers import (
 from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.estimator.filters.shots import simulator
 from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.objectives import uncertainty_weighted_displacement
 from jiggle_mj.estimator.policies.policy import STEP, Policy
 from jiggle_mj.estimator.policies.workspace import Bounds, bounds
 from jiggle_mj.estimator.xpbd import XPBD
@@ -97,13 +96,8 @@ class Controlled(Policy):
         )
 
     def _scaled(self, estimator: Estimator) -> Scales:
-        rest = jnp.asarray(estimator.sheet.rest)
-        lifted = rest + jnp.array([[0.0, 0.0, 0.01]])
-        return Scales(
-            displacement=uncertainty_weighted_displacement(lifted, rest, jnp.asarray(_covariance(estimator))),
-            energy=jnp.asarray(self._limits.energy),
-            noise=jnp.asarray(SENSED),
-        )
+        rest, covariance = jnp.asarray(estimator.sheet.rest), jnp.asarray(_covariance(estimator))
+        return Scales.at_prior(rest, covariance, energy=self._limits.energy, noise=SENSED)
 
 
 class Local(Controlled):

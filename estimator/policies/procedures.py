@@ -19,8 +19,8 @@ CYCLE = 40
 """Most steps of looking before an act, and after the last."""
 CHECKED = 0.002
 """A gain for which no step is worth taking once an act is to be checked [nat per particle]."""
-ROOM = 1.6
-"""Width of a cut [spacings]: every particle on its path lies inside."""
+ROOM = 2.4
+"""Width of a cut [spacings]: the particles on its path and a ring around them, as well as an attachment is located."""
 FREE = 0.2
 """P(attached) up to which a place is free enough to be sewn."""
 
