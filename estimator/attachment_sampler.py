@@ -213,7 +213,7 @@ class Pending(eqx.Module):
             covariance=self.covariance,
             columns=self.columns.at[self.count].set(column),
             factors=self.factors.at[self.count].set(factor),
-            count=self.count + is_any,
+            count=self.count + is_any.astype(self.count.dtype),
         )
 
     def done(self) -> Float[Array, "n n"]:
