@@ -98,7 +98,10 @@ def run_scene(
         said = "" if chooses is None else f"{policy}, {steps} steps, {settings(estimator.config)}"
         about = {RECORDED: scene.name, IDENTITY: recording_identity(scene, sensing, seed, said)}
         does = actions(scene, chooses, estimator, steps)
-        frames = observe(reference, does, directory / RECORDING, seed=seed, policy=said, watch=watch)
+        refused = None if chooses is None else chooses.refused
+        frames = observe(
+            reference, does, directory / RECORDING, seed=seed, policy=said, watch=watch, on_refused=refused
+        )
         episode = estimate(frames, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
     unscored = _result(
         episode,

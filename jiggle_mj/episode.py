@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jiggle_mj.errors import OutputError, PerceptionError
+from jiggle_mj.errors import ActionError, OutputError, PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.estimate_recording import EstimateWriter
 from jiggle_mj.mcap_files import truth_path
@@ -107,6 +107,7 @@ def observe(
     policy: str = "",
     overwrite: bool = False,
     watch: Stopwatch | None = None,
+    on_refused: Callable[[ActionError], None] | None = None,
 ) -> Iterator[Observation]:
     """Carry out actions on the reference tissue, one observation each but where a frame was lost.
 
@@ -118,6 +119,7 @@ def observe(
         policy: who chooses the actions, with all that it depends on; empty for the scene's programme.
         overwrite: replace files that are there.
         watch: adds up the time of the simulation.
+        on_refused: told of an action that cannot be carried out, which is the end; if None, it is raised.
     """
     watch = watch or Stopwatch()
     with ExitStack() as files:
@@ -148,8 +150,14 @@ def observe(
                 )
             )
         for action in actions:
-            with watch:
-                observation = reference.step(action)
+            try:
+                with watch:
+                    observation = reference.step(action)
+            except ActionError as refused:
+                if on_refused is None:
+                    raise
+                on_refused(refused)
+                break
             if observation.lost:
                 continue
             if recording is not None and truth_file is not None:

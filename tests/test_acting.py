@@ -173,6 +173,23 @@ def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, mon
     assert figures["ended"].startswith("all 60 steps" if fails else "nothing is attached any more")
 
 
+class Misses(Corners):
+    """Grasps one corner, and then thin air."""
+
+    def plan(self, estimator):
+        planned = super().plan(estimator)
+        if len(self.decisions) > 2 and not isinstance(planned, str) and isinstance(planned[0], Grasp):
+            return Grasp(point=np.array([0.0, 0.0, 0.5]), radius=8e-3), "thin air"
+        return planned
+
+
+def test_a_grasp_that_misses_ends_the_run_and_loses_nothing(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("jiggle_mj.eval.experiment.policy_named", lambda *_, **__: Misses())
+    figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="information")
+    assert figures["ended"].startswith("an action could not be carried out: grasp at")
+    assert figures["detection"]["n_attached"] > 0 and (tmp_path / "out" / "report.html").exists()
+
+
 def test_options_that_do_not_fit_are_refused(scene):
     with pytest.raises(OptionError, match="policy = 'best': must be one of corners, information"):
         policy_named("best", scene, seed=0)

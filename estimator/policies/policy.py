@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from jiggle_mj.estimator.estimator import Estimator
 
+from jiggle_mj.errors import ActionError
 from jiggle_mj.observation import Action
 
 STEP = 5e-3
@@ -44,6 +45,10 @@ class Policy(ABC):
         Args:
             estimator: after the latest observation.
         """
+
+    def refused(self, error: ActionError) -> None:
+        """Say that the last action, a grasp beside the tissue for example, could not be carried out; it is the end."""
+        self.ended = f"an action could not be carried out: {error}"
 
     def actions(self, estimator: Estimator, *, steps: int) -> Iterator[Action]:
         """At most `steps` actions; an interrupted plan (Ctrl-C) is the end of them, and what was seen is kept."""
