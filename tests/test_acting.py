@@ -18,7 +18,7 @@ from tiny_scene import SCENE, call, scene_file
 
 from jiggle_mj.errors import OptionError
 from jiggle_mj.limits import Limits
-from jiggle_mj.observation import Declaration, Grasp, Move, Release, Wait
+from jiggle_mj.observation import Action, Declaration, Grasp, Move, Release, Wait
 from jiggle_mj.policies import POLICIES
 
 PAPERS = ("sl-d", "lg-d", "lg-h", "pmp-up", "pmp-left")
@@ -145,7 +145,7 @@ class Corners(Policy):
         ways = ((-1, -1), (1, -1), (1, 1), (-1, 1))
         self._left = [(way, height) for way in ways for height in (None, 0.01, 0.02, 0.03, 0.0, "open")]
 
-    def plan(self, estimator):
+    def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
         if not self._left:
             return "enough was seen"
         way, height = self._left.pop(0)
@@ -176,7 +176,7 @@ def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, mon
 class Misses(Corners):
     """Grasps one corner, and then thin air."""
 
-    def plan(self, estimator):
+    def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
         planned = super().plan(estimator)
         if len(self.decisions) > 2 and not isinstance(planned, str) and isinstance(planned[0], Grasp):
             return Grasp(point=np.array([0.0, 0.0, 0.5]), radius=8e-3), "thin air"
