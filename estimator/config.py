@@ -35,8 +35,8 @@ class EstimatorConfig:
     grip_stiffness: float = 3.0
     """Of the springs that carry held particles with the tip while the state is searched [k]."""
     judge_each_grasp: bool = True
-    """Whether the implicit filter's belief is judged by samples whenever the jaws open, or only at the end, which saves
-    a policy's user seconds to minutes of waiting."""
+    """Whether the implicit filter judges noise and belief thoroughly whenever the jaws open, or only at the end, which
+    saves a policy's user seconds to minutes of waiting: in passing a few samples do."""
     detect_above: float = 0.011
     """Filters that state no probability report a particle attached when its mean stiffness exceeds this [k]."""
 

@@ -1,7 +1,7 @@
 """Which actions a run takes: the scene's own programme, or those of a policy that looks at the estimate."""
 
 from collections.abc import Iterator
-from functools import partial
+from functools import cache, partial
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ from jiggle_mj.estimator.policies.information import Information
 from jiggle_mj.estimator.policies.paper import PAPER, Primitive
 from jiggle_mj.estimator.policies.policy import Policy
 from jiggle_mj.estimator.policies.procedures import Detach, Procedure, Sew
+from jiggle_mj.estimator.policies.tweezer import Tweezer
 from jiggle_mj.eval.score import Json
 
 from jiggle_mj.errors import OptionError
@@ -19,6 +20,7 @@ from jiggle_mj.policies import POLICIES
 if TYPE_CHECKING:
     from jiggle_mj.scenes import Scene
 
+PRIMITIVE = "pmp-"
 STEPS, LONG = 40, 400
 """Most actions of a policy, and of one that cuts or sews, if nothing else is said."""
 
@@ -37,19 +39,28 @@ def policy_named(name: str | None, scene: "Scene", *, seed: int) -> Policy | Non
     name, limits = scene.programme.policy if name is None else name, scene.limits.limits()
     if name not in POLICIES:
         raise OptionError(f"policy = {name!r}: must be one of {', '.join(POLICIES)}.")
-    look = partial(Information, limits, radius=scene.tweezer.radius, seed=seed)
     if name == "corners":
         return None
+    if name in PAPER:
+        return PAPER[name](limits, seed=seed)
+    if name.startswith(PRIMITIVE):
+        return Primitive(name.removeprefix(PRIMITIVE))
+    look = partial(Information, limits, radius=scene.tweezer.radius, seed=seed, tweezer=_tweezer())
     if name == "information":
         return look()
     if name == "one-grasp":
         return look(regrasps=False)
     if name == "detach":
         return Detach(look)
-    if name == "suture":
-        plan = scene.procedure
-        return Sew(look, length=plan.suture_length, width=plan.suture_width, stiffness=plan.suture_stiffness)
-    return PAPER[name](limits, seed=seed) if name in PAPER else Primitive(name.removeprefix("pmp-"))
+    plan = scene.procedure
+    return Sew(look, length=plan.suture_length, width=plan.suture_width, stiffness=plan.suture_stiffness)
+
+
+@cache
+def _tweezer() -> Tweezer:
+    from jiggle_mj.scenes.tissue import TWEEZER
+
+    return Tweezer.read(TWEEZER.read_text(encoding="utf-8"))
 
 
 def check_goes_with(policy: Policy, config: EstimatorConfig) -> None:

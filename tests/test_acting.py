@@ -110,6 +110,25 @@ def test_jaws_that_closed_unseen_are_opened(ours, monkeypatch):
     assert isinstance(action, Release) and "no frame has shown" in why
 
 
+def test_a_tip_out_of_reach_is_taken_back_and_it_says_where_it_was(ours, monkeypatch):
+    _, loop = ours
+    far = replace(loop.estimator.tool, position=np.array([0.0, 0.0, 0.2]))
+    monkeypatch.setattr(Estimator, "tool", property(lambda _: far))
+    action, why = Information(Limits(), radius=8e-3, seed=0).plan(loop.estimator)
+    assert isinstance(action, Move) and "the tip at 0 0 200 mm is out of reach" in why
+    np.testing.assert_array_equal(action.to, loop.estimator.hold.tip)
+
+
+def test_a_tool_that_touches_the_bed_everywhere_grasps_nothing(ours, scene, monkeypatch):
+    """Upside down, its shaft would have to go through the bed."""
+    _, loop = ours
+    upturned = replace(loop.estimator.tool, quat_wxyz=np.array([0.0, 1.0, 0.0, 0.0]), closed=False)
+    monkeypatch.setattr(Estimator, "tool", property(lambda _: upturned))
+    policy = policy_named("information", scene, seed=0)
+    assert policy is not None
+    assert policy.plan(loop.estimator) == "no place of the sheet is within the tool's reach"
+
+
 class Interrupted(Policy):
     def plan(self, estimator):
         if self.decisions:

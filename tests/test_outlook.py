@@ -1,11 +1,16 @@
 """What is predicted of a pull: the gain against Monte Carlo, scenarios against the belief, loads by hand."""
 
+import os
+import subprocess
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jiggle_mj.estimator.outlook import Outlook, Tug, expected_fall
+from jiggle_mj.estimator.policies.information import at_once, outcomes
 from jiggle_mj.estimator.spike_and_slab import Mixture
 from small_sheet import GRIP_RADIUS, NOISE, attached, corners, sheet, sheet_balance, sheet_prior
 
@@ -86,3 +91,34 @@ def test_a_pull_at_what_is_attached_loads_it_more_the_higher_it_goes(outlook):
 def test_free_tissue_bears_nothing(outlook):
     found = eqx.filter_jit(outlook.outcome)(lift(18e-3), jnp.zeros(sheet().n))
     assert found.energy == 0 and found.force == 0 and found.gain > 0
+
+
+def test_pulls_dealt_out_to_two_devices_have_the_outcomes_of_one():
+    """In a process of its own, as JAX has one CPU device unless told otherwise before it starts.
+
+    With no more threads than devices, XLA on a CPU would wait for itself.
+    """
+    said = subprocess.run(
+        [sys.executable, __file__],
+        env=os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "NPROC": "8", "JAX_ENABLE_X64": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert said.stdout.split() == ["2", "devices"]
+
+
+def _dealt() -> None:
+    """Three pulls in three scenarios: nine pairs, which two devices cannot share evenly."""
+    belief = sheet_prior()
+    predicted = Outlook(balance=sheet_balance(1e-4), belief=belief, precision=SIGHT)
+    s = predicted.scenarios(jax.random.key(0), 3, unknown=1.0)
+    tugs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(lift, (0.005, 0.01, 0.015)))
+    together, apart = (of(predicted, tugs, s, informative=False) for of in (at_once, outcomes))
+    for one, other in zip(jax.tree.leaves(together), jax.tree.leaves(apart), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
+    print(len(jax.devices()), "devices")
+
+
+if __name__ == "__main__":
+    _dealt()

@@ -5,7 +5,7 @@ attachment shows only once its surroundings are believed stiff: when the jaws op
 what is believed now are linearised again, and replace what they said before. Nothing is counted twice.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -36,7 +36,7 @@ make it even, so that a free and an attached stretch are equally likely beforeha
 find everything attached where little is known, or nothing."""
 BURN_IN, PASSING, SAMPLES = 3, (3, 1), (20, 3)
 """Rounds of samples when the jaws open: left out, and see `Sampler.run`, how many and how often as many again as all so
-far at most, while grasps are linearised again and at the end."""
+far at most, in passing and at the end."""
 STALE = 0.1
 """A grasp is linearised again when some s has moved further than this from where it was."""
 FELT = 3e-3
@@ -80,12 +80,12 @@ class ImplicitFilter(Filter):
     def release(self, belief: AttachmentBelief, *, thorough: bool = True) -> Stated | None:
         """The belief with all grasps linearised again that need it; the next frame begins another grasp.
 
-        In passing the noise is not judged, and propagation has to do in place of samples.
+        In passing the noise is not judged, and few samples have to do.
         """
         if self._between and not (thorough and self._due):
             return None
         self._between, self._due = True, not thorough
-        return self._judged(belief) if thorough else self._settled(_swept(belief), STALE, 1, _swept)
+        return self._judged(belief) if thorough else self._settled(_sampled(belief, PASSING), STALE, 1)
 
     def restart(self, belief: AttachmentBelief) -> Stated:
         """Keep a belief as it is: no frame from before is judged again. The next one begins another grasp."""
@@ -129,9 +129,7 @@ class ImplicitFilter(Filter):
             stated = self._settled(stated, STALE, PASSES)
         return _sampled(stated.belief, SAMPLES)
 
-    def _settled(
-        self, stated: Stated, far: float, passes: int, judge: Callable[[AttachmentBelief], Stated] | None = None
-    ) -> Stated:
+    def _settled(self, stated: Stated, far: float, passes: int) -> Stated:
         """After grasps that were linearised further than `far` from what is believed were linearised again."""
         for _ in range(passes):
             belief = stated.belief
@@ -146,7 +144,7 @@ class ImplicitFilter(Filter):
             ]
             total = tuple(kept + new for kept, new in zip(self._kept, self._total(), strict=True))
             belief = eqx.tree_at(lambda one: (one.precision, one.shift), belief, total)
-            stated = _sampled(belief, PASSING) if judge is None else judge(belief)
+            stated = _sampled(belief, PASSING)
         return stated
 
     def _total(self) -> tuple[Any, Any]:

@@ -3,7 +3,7 @@
 Each plan looks a few steps ahead from where the jaws are, in several directions, and at lifts from other places. While
 a grasp lasts, a place keeps its worth until it would be the best: what is learned mostly lowers it, so only the best
 are looked at again [lazy greedy: Minoux 1978, doi:10.1007/BFb0006528]. Letting go and grasping again costs `REGRASP`
-steps. A place that taught less than it promised is promised that much less when it is thought of again.
+steps.
 
 Safe is a step after which, in the scenarios of the belief, neither the mean boundary energy nor the force on any
 attachment passes its limit, less a margin, with more than the allowed chance: their square root and it are taken as
@@ -11,6 +11,7 @@ normal over the scenarios. Particles in the jaws and their neighbours, on which 
 free: inside the sheet no place is grasped that is not known to be, and the first is on its edge.
 """
 
+import math
 from itertools import product
 from statistics import NormalDist
 
@@ -18,19 +19,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.outlook import Outcome, Outlook, Tug
 from jiggle_mj.estimator.policies.policy import STEP, Policy
-from jiggle_mj.estimator.policies.workspace import bounds
+from jiggle_mj.estimator.policies.tweezer import Tweezer
+from jiggle_mj.estimator.policies.workspace import Workspace
 
 from jiggle_mj.limits import Limits
 from jiggle_mj.observation import Action, Grasp, Move, Release
 
-AHEAD = (3, 1)
-"""Steps that a pull is followed for, where the jaws are; fewer where that many are not allowed."""
+AHEAD = (0.5, 1, 3)
+"""Steps that a pull is followed for, where the jaws are; each direction is worth what the best of them teaches."""
 LIFTS = (1, 3, 6)
 """Steps of the lifts that other places are judged by."""
 REGRASP = 3
@@ -38,14 +41,11 @@ REGRASP = 3
 PLACES = 12
 """Of grasps, spread over the sheet."""
 TRIED = 3
-"""Directions, best first, that are looked at for a safe one."""
+"""Pulls, best first, that are looked at for a safe one."""
 EXPECTED, JUDGED = 2, 16
 """Scenarios that a gain is the mean of, and that a step's safety is judged by."""
 ENOUGH = 0.004
 """A gain for which no step is worth taking [nat per particle]."""
-TIRED = 3
-"""Steps in a row that taught no more than that, after which a grasp is left, whatever the next promises: the model's
-error is the same where the tissue is the same, and another look from there says little new."""
 MARGIN = 0.75
 """Share of the limits that a plan keeps to: it does not know by how much its model errs. A step that all scenarios put
 below the limit has exceeded it by 0.3."""
@@ -73,7 +73,14 @@ class Information(Policy):
     """Plans for one sheet."""
 
     def __init__(
-        self, limits: Limits, *, radius: float, seed: int, regrasps: bool = True, enough: float = ENOUGH
+        self,
+        limits: Limits,
+        *,
+        radius: float,
+        seed: int,
+        tweezer: Tweezer | None = None,
+        regrasps: bool = True,
+        enough: float = ENOUGH,
     ) -> None:
         """Say what is allowed.
 
@@ -81,19 +88,16 @@ class Information(Policy):
             limits: on the attachments, and on where the tip may go.
             radius: of the jaws [m].
             seed: draws the scenarios.
+            tweezer: kept clear of the bed; if None, nothing but the tip is known of the tool.
             regrasps: whether to let go and grasp elsewhere; if not, the jaws are closed by somebody else.
             enough: a gain for which no step is worth taking [nat per particle].
         """
         super().__init__()
         self.regrasps, self._enough = regrasps, enough
-        self._limits, self._radius, self._key = limits, radius, jax.random.key(seed)
+        self._limits, self._radius, self._tweezer, self._key = limits, radius, tweezer, jax.random.key(seed)
         self._energy, self._force = MARGIN * limits.energy, MARGIN * limits.force
         self._worth: dict[int, float] = {}
-        self._place: int | None = None
-        self._promised = np.inf
-        self._kept: dict[int, float] = {}
         self._leaving = self._over = ""
-        self._entropy: list[float] = []
 
     def leave(self, why: str) -> None:
         """Plan no more than what it takes to let go."""
@@ -114,10 +118,8 @@ class Information(Policy):
                 return Release(), self._leaving
             if self._leaving:
                 return Release(), self._leaving
-            self._entropy.append(float(outlook.belief.entropy()))
             enough = self._enough * len(estimator.sheet.rest)
-            tired = len(self._entropy) > TIRED and self._entropy[-1 - TIRED] - self._entropy[-1] < TIRED * enough
-            found = None if self._over or tired else self._best_pull(estimator, outlook)
+            found = None if self._over else self._best_pull(estimator, outlook)
             if self._over:
                 self._leaving = self._over
             elif found is not None:
@@ -126,8 +128,11 @@ class Information(Policy):
                 if rate >= enough and elsewhere is None:
                     return Move(to=to), f"{rate:.0f} nat a step"
                 self._leaving = "another place teaches more" if elsewhere is not None else "little is left to learn"
+            elif self._reached(estimator, tool.position + STEP * DIRECTIONS).any():
+                self._leaving = "no pull from here is safe"
             else:
-                self._leaving = "nothing new is learned from here" if tired else "no pull from here is safe"
+                at = " ".join(f"{1e3 * part:.0f}" for part in tool.position)
+                self._leaving = f"the tip at {at} mm is out of reach, or the tool touches the bed"
             if not self.regrasps:
                 return self._leaving
             if np.linalg.norm(tool.position - hold.tip) < STEP / 10:
@@ -135,10 +140,7 @@ class Information(Policy):
             return Move(to=hold.tip), self._leaving
 
     def _grasp(self, estimator: Estimator, outlook: Outlook) -> tuple[Action, str] | str:
-        if self._place is not None and self._entropy:
-            taught = (self._entropy[0] - self._entropy[-1]) / (len(self._entropy) - 1 + REGRASP)
-            self._kept[self._place] = float(np.clip(taught / self._promised, 0, 1))
-        self._leaving, self._entropy, self._place = "", [], None
+        self._leaving = ""
         if self._over:
             return self._over
         probability = np.asarray(outlook.belief.mixture().attached)
@@ -147,31 +149,31 @@ class Information(Policy):
             return f"enough is known: every P(attached) is below {DECIDED:g} or above {1 - DECIDED:g}"
         enough, self._worth = self._enough * len(unsure), dict.fromkeys(self._worth, np.inf)
         place = self._best_place(estimator, outlook, above=enough)
+        if not self._worth:
+            return "no place of the sheet is within the tool's reach"
         if place is None:
             return f"no safe pull teaches {enough:.2g} nat a step; {int(unsure.sum())} of {len(unsure)} are not decided"
-        self._place, self._promised = place, self._worth[place]
         return Grasp(point=estimator.positions[place], radius=self._radius), f"{self._worth[place]:.0f} nat a step"
 
     def _best_pull(self, estimator: Estimator, outlook: Outlook) -> tuple[Float[np.ndarray, " 3"], float] | None:
         """Where the tip goes next, and what each step that way is expected to teach [nat]; None if nothing is safe."""
         hold, tool = estimator.hold, estimator.tool
         assert hold is not None and tool is not None
-        low, high = bounds(estimator, self._limits)
         few, many = self._drawn(outlook)
         start = estimator.positions
 
         def tugs(tips: Float[np.ndarray, "k 3"]) -> Tug:
             return self._tugs(estimator, hold.held, start, hold.closed_at + (tips - hold.tip)[:, None])
 
-        for ahead in AHEAD:
-            ends = tool.position + ahead * STEP * DIRECTIONS
-            inside = ((low <= ends) & (ends <= high)).all(axis=1)
-            rate = np.where(inside, self._allowed_gain(outcomes(outlook, tugs(ends), few)).mean(axis=1) / ahead, 0.0)
-            best = [i for i in np.argsort(-rate)[:TRIED] if rate[i] > 0]
-            for share, i in product(SHORTER, best):
-                tip = tool.position + share * STEP * DIRECTIONS[i]
-                if self._safe(outlook, tugs(tip[None]), many):
-                    return tip, float(rate[i])
+        ahead, ways = (part.ravel() for part in np.meshgrid(AHEAD, np.arange(len(DIRECTIONS))))
+        ends = tool.position + STEP * ahead[:, None] * DIRECTIONS[ways]
+        gain = self._allowed_gain(outcomes(outlook, tugs(ends), few)).mean(axis=1)
+        rate = np.where(self._reached(estimator, ends), gain / np.maximum(ahead, 1), 0.0)
+        best = [i for i in np.argsort(-rate)[:TRIED] if rate[i] > 0]
+        for share, i in product(SHORTER, best):
+            tip = tool.position + share * STEP * min(ahead[i], 1) * DIRECTIONS[ways[i]]
+            if self._safe(outlook, tugs(tip[None]), many):
+                return tip, float(rate[i])
         return None
 
     def _best_place(self, estimator: Estimator, outlook: Outlook, *, above: float) -> int | None:
@@ -179,15 +181,14 @@ class Information(Policy):
         rest = estimator.sheet.rest
         if not self._worth:
             self._edge = SheetMesh(rest, estimator.sheet.faces).border
-            self._worth = dict.fromkeys(_spread(rest, PLACES).tolist(), np.inf)
+            places = _spread(rest, PLACES)
+            self._worth = dict.fromkeys(places[self._reached(estimator, rest[places])].tolist(), np.inf)
         probability = np.asarray(outlook.belief.mixture().attached)
         few, many = self._drawn(outlook)
         here = None if estimator.hold is None else estimator.hold.tip
         fresh: set[int] = set()
-        while True:
+        while max(self._worth.values(), default=0.0) > above:
             best = max(self._worth, key=lambda place: self._worth[place])
-            if self._worth[best] <= above:
-                return None
             held = np.linalg.norm(rest - rest[best], axis=1) <= self._radius
             if best in fresh:
                 if self._safe(
@@ -200,7 +201,7 @@ class Information(Policy):
             at_hand = here is not None and np.linalg.norm(rest[best] - here) < self._radius
             suspect = probability[estimator.loaded(held)].max() > (SUSPECTED if self._edge[best] else KNOWN)
             self._worth[best] = 0.0 if at_hand or suspect else self._lifted(estimator, outlook, held, few)
-            self._worth[best] *= self._kept.get(best, 1.0)
+        return None
 
     def _lifted(
         self, estimator: Estimator, outlook: Outlook, held: Bool[np.ndarray, " n"], few: Float[Array, "_few n"]
@@ -215,6 +216,10 @@ class Information(Policy):
         )
         best = np.maximum.accumulate(self._allowed_gain(found), axis=0)
         return float((best.mean(axis=1) / (REGRASP + np.array(LIFTS))).max())
+
+    def _reached(self, estimator: Estimator, tips: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
+        assert estimator.tool is not None
+        return Workspace.around(estimator, self._limits, self._tweezer).reached(tips, estimator.tool)
 
     def _tugs(
         self,
@@ -253,9 +258,9 @@ def _scenarios(outlook: Outlook, key: PRNGKeyArray, count: int, unknown: Float[A
 
 
 def outcomes(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
-    """Of each tug in each scenario: at once on a GPU, in turn on a CPU, where one compilation serves any number."""
+    """Of each tug in each scenario: at once on GPUs, in turn on a CPU, where one compilation serves any number."""
     if jax.default_backend() != "cpu":
-        return _at_once(outlook, tugs, s, informative=informative)
+        return at_once(outlook, tugs, s, informative=informative)
     each_tug = [jax.tree.map(lambda leaf, i=i: leaf[i], tugs) for i in range(len(tugs.to))]
     found = [[_outcome(outlook, tug, one, informative=informative) for one in s] for tug in each_tug]
     stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *row) for row in found]
@@ -268,11 +273,27 @@ def _outcome(outlook: Outlook, tug: Tug, s: Float[Array, " n"], *, informative: 
 
 
 @eqx.filter_jit
-def _at_once(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool) -> Outcome:
-    def one(tug: Tug) -> Outcome:
-        return jax.vmap(lambda s: _outcome(outlook, tug, s, informative=informative))(s)
+def at_once(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
+    """The same, the pairs of tug and scenario dealt out to all devices, each of which iterates for itself."""
+    shape, devices = (len(tugs.to), len(s)), jax.devices()
+    pairs = jnp.arange(-(-math.prod(shape) // len(devices)) * len(devices)) % math.prod(shape)
+    known, rest = eqx.partition((outlook, tugs, s), eqx.is_array)
 
-    return jax.vmap(one)(tugs)
+    def some(known: tuple, pairs: Int[Array, " some"]) -> Outcome:
+        outlook, tugs, s = eqx.combine(known, rest)
+
+        def one(pair: Int[Array, ""]) -> Outcome:
+            tug = jax.tree.map(lambda leaf: leaf[pair // len(s)], tugs)
+            return _outcome(outlook, tug, s[pair % len(s)], informative=informative)
+
+        return jax.vmap(one)(pairs)
+
+    dealt, everywhere = PartitionSpec("pairs"), PartitionSpec()
+    mesh = Mesh(np.array(devices), ("pairs",))
+    found = jax.shard_map(
+        some, mesh=mesh, in_specs=(everywhere, dealt), out_specs=dealt, check_vma=False
+    )(known, pairs)  # fmt: skip
+    return jax.tree.map(lambda leaf: leaf[: math.prod(shape)].reshape(*shape, *leaf.shape[1:]), found)
 
 
 def _spread(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " _count"]:

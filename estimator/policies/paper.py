@@ -29,7 +29,7 @@ from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.estimator.filters.shots import simulator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.policies.policy import STEP, Policy
-from jiggle_mj.estimator.policies.workspace import Bounds, bounds
+from jiggle_mj.estimator.policies.workspace import Workspace
 from jiggle_mj.estimator.xpbd import XPBD
 
 from jiggle_mj.limits import Limits
@@ -71,14 +71,14 @@ class Controlled(Policy):
                 self._simulator = simulator(SheetMesh(sheet.rest, sheet.faces), estimator.declaration)
                 self._scales = self._scaled(estimator)
             situation = self._situation(estimator)
-            to = np.asarray(self.choose(self._simulator, situation, bounds(estimator, self._limits)))
+            to = np.asarray(self.choose(self._simulator, situation, Workspace.around(estimator, self._limits)))
         if not np.isfinite(to).all():
             return "the simulator has no finite prediction"
         if np.linalg.norm(to - np.asarray(situation.tip)) < STILL:
             return "no step lowers the loss"
         return Move(to=to), "the controller's step"
 
-    def choose(self, simulator: XPBD, situation: Situation, bounds: Bounds) -> Float[Array, " 3"]:
+    def choose(self, simulator: XPBD, situation: Situation, workspace: Workspace) -> Float[Array, " 3"]:
         """Where the tip goes."""
         raise NotImplementedError
 
@@ -108,7 +108,7 @@ class Local(Controlled):
         super().__init__(limits, seed=seed)
         self._loss = loss
 
-    def choose(self, simulator: XPBD, situation: Situation, bounds: Bounds) -> Float[Array, " 3"]:
+    def choose(self, simulator: XPBD, situation: Situation, workspace: Workspace) -> Float[Array, " 3"]:
         """See `Controlled.choose`; the gradient alone keeps to the workspace, as in the paper."""
         return _local(self._loss, simulator, situation, self._scales)
 
@@ -121,9 +121,9 @@ class Sampled(Controlled):
         super().__init__(limits, seed=seed)
         self._samples: Samples | None = None
 
-    def choose(self, simulator: XPBD, situation: Situation, bounds: Bounds) -> Float[Array, " 3"]:
+    def choose(self, simulator: XPBD, situation: Situation, workspace: Workspace) -> Float[Array, " 3"]:
         """See `Controlled.choose`."""
-        low, high = map(jnp.asarray, bounds)
+        low, high = jnp.asarray(workspace.low), jnp.asarray(workspace.high)
         self._key, first, key = jax.random.split(self._key, 3)
         if self._samples is None:
             drawn = jax.random.uniform(first, (SAMPLES, 3), low.dtype, low[None], high[None])

@@ -1,0 +1,91 @@
+"""A tool's kinematics through MJX, from its own MJCF alone: how far it is above the bed, wherever its tip is taken.
+
+The only place in the estimator that imports MuJoCo, and only once a tool is read: everything else runs without it.
+"""
+
+import contextlib
+import io
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jiggle_mj.errors import OptionError
+
+
+class Tweezer(eqx.Module):
+    """A tool whose frame has its origin at the tip, and jaws on hinges that are closed at 0."""
+
+    model: Any
+    """MJX's."""
+    data: Any
+    openings: Float[Array, "openings joints"]
+    """Angles of the jaws, closed and as far open as they go [rad]."""
+
+    @classmethod
+    def read(cls, mjcf: str) -> "Tweezer":
+        """Compile a tool.
+
+        Args:
+            mjcf: the XML; one mocap body, whose origin is the tip, made of spheres and capsules.
+
+        Raises:
+            OptionError: it is no such tool.
+        """
+        mujoco, mjx = _mjx()
+        try:
+            model = mujoco.MjModel.from_xml_string(mjcf)
+        except ValueError as failure:
+            raise OptionError(f"the tool's MJCF does not compile: {failure}") from failure
+        round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+        if not (model.nmocap == 1 and model.ngeom and np.isin(model.geom_type, round_ones).all()):
+            raise OptionError(
+                "the tool must be one mocap body, its origin at the tip, of spheres and capsules alone; "
+                f"got {model.nmocap} mocap bodies, and geoms of types {sorted(set(model.geom_type.tolist()))}."
+            )
+        if not (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).all():
+            raise OptionError("the tool's joints must be hinges, with the jaws closed at 0.")
+        with jax.enable_x64(True):
+            openings = jnp.asarray(np.array([np.zeros(model.njnt), model.jnt_range[:, 1]]))
+            return cls(model=mjx.put_model(model), data=mjx.make_data(model), openings=openings)
+
+    def clearance(self, tip: Float[Array, " 3"], quat_wxyz: Float[Array, " 4"]) -> Float[Array, ""]:
+        """Height of the tool's lowest point, with the jaws closed or open, whichever is lower [m].
+
+        MJX gives a mocap body its pose after its children had theirs, so the pose is set as the body's own.
+
+        Args:
+            tip: where the tip is [m].
+            quat_wxyz: orientation of the tool.
+        """
+        _, mjx = _mjx()
+        model, base = self.model, int(np.flatnonzero(np.asarray(self.model.body_mocapid) >= 0)[0])
+        quat = quat_wxyz / jnp.linalg.norm(quat_wxyz)
+        placed = {"body_pos": model.body_pos.at[base].set(tip), "body_quat": model.body_quat.at[base].set(quat)}
+        posed = model.replace(**placed)
+
+        def lowest(opening: Float[Array, " joints"]) -> Float[Array, ""]:
+            data = self.data.replace(qpos=opening, mocap_pos=tip[None], mocap_quat=quat[None])
+            with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+                data = mjx.kinematics(posed, data)
+            radius, half = jnp.asarray(model.geom_size)[:, 0], jnp.asarray(model.geom_size)[:, 1]
+            return jnp.min(data.geom_xpos[:, 2] - half * jnp.abs(data.geom_xmat[:, 2, 2]) - radius)
+
+        return jnp.min(jax.vmap(lowest)(self.openings))
+
+
+@eqx.filter_jit
+def clearances(tweezer: Tweezer, tips: Float[Array, "k 3"], quat_wxyz: Float[Array, " 4"]) -> Float[Array, " k"]:
+    """See `Tweezer.clearance`; of many tips at once [m]."""
+    return jax.vmap(lambda tip: tweezer.clearance(tip, quat_wxyz))(tips)
+
+
+def _mjx() -> tuple[Any, Any]:
+    """Imported here, as it takes seconds and says on stdout which of its other engines are missing."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        import mujoco
+        from mujoco import mjx
+    return mujoco, mjx
