@@ -15,12 +15,11 @@ from jiggle_mj.eval.score import Json
 
 from jiggle_mj.errors import OptionError
 from jiggle_mj.observation import Action
-from jiggle_mj.policies import POLICIES
+from jiggle_mj.policies import POLICIES, PRIMITIVES
 
 if TYPE_CHECKING:
     from jiggle_mj.scenes import Scene
 
-PRIMITIVE = "pmp-"
 STEPS, LONG = 40, 400
 """Most actions of a policy, and of one that cuts or sews, if nothing else is said."""
 
@@ -43,8 +42,8 @@ def policy_named(name: str | None, scene: "Scene", *, seed: int) -> Policy | Non
         return None
     if name in PAPER:
         return PAPER[name](limits, seed=seed)
-    if name.startswith(PRIMITIVE):
-        return Primitive(name.removeprefix(PRIMITIVE))
+    if name in PRIMITIVES:
+        return Primitive(name.removeprefix("pmp-"))
     look = partial(Information, limits, radius=scene.tweezer.radius, seed=seed, tweezer=_tweezer())
     if name == "information":
         return look()

@@ -29,12 +29,10 @@ from plotly.subplots import make_subplots
 from jiggle_mj.episode import ESTIMATE, RECORDING, RESULT
 from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
 from jiggle_mj.mcap_files import truth_path
-from jiggle_mj.policies import POLICIES as ALL
-from jiggle_mj.policies import PolicyName
+from jiggle_mj.policies import PRIMITIVES, PolicyName
 from jiggle_mj.truth_recording import read_truth
 
 SCENES = ("arc", "line", "line_dot", "arc_line", "u_shape", "large_attach")
-PRIMITIVES: tuple[PolicyName, ...] = tuple(name for name in ALL if name.startswith("pmp-"))
 POLICIES: tuple[PolicyName, ...] = ("information", "one-grasp", "sl-d", "lg-d", "lg-h", *PRIMITIVES)
 BEST = "PMP, best"
 """The primitive with the most entropy reduction in each run, as the paper gives it."""

@@ -1,6 +1,6 @@
 """How planning grows with the sheet: seconds for one action of the paper's SL-D and for one of ours, at each size.
 
-SL-D: 100 samples, five iterations. Ours: nine pulls in two tissues each for what they teach, and one in sixteen for
+SL-D: 100 samples, five iterations. Ours: all pulls in two tissues each for what they teach, and one in sixteen for
 whether it is safe, as `Information` plans where the jaws are. Compilation is not counted.
 """
 
@@ -14,8 +14,8 @@ from jiggle_mj.estimator.config import EstimatorConfig
 from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
 from jiggle_mj.estimator.outlook import Outlook, Tug
-from jiggle_mj.estimator.policies.information import DIRECTIONS, EXPECTED, JUDGED, outcomes
-from jiggle_mj.estimator.policies.policy import STEP
+from jiggle_mj.estimator.policies.information import EXPECTED, JUDGED, PULLS
+from jiggle_mj.estimator.policies.outcomes import outcomes
 from jiggle_mj.eval.benchmark import NOISE, Case, case, sl_d, timed
 
 SIZES = (600, 1200, 2400)
@@ -46,8 +46,8 @@ def our_plan(one: Case) -> Callable[[], object]:
     outlook = Outlook(balance=filter.balance, belief=belief, precision=jnp.eye(3) / NOISE**2)
     pull, held = one.frames[-1].pull, one.frames[-1].held
     assert pull is not None
-    ends = pull.before[None] + STEP * jnp.asarray(DIRECTIONS)[:, None]
-    many = (len(DIRECTIONS), *held.shape)
+    ends = pull.before[None] + jnp.asarray(PULLS)[:, None]
+    many = (len(PULLS), *held.shape)
     tugs = Tug(
         start=jnp.broadcast_to(pull.before[None], ends.shape),
         held=jnp.broadcast_to(held[None], many),

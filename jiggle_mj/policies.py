@@ -19,3 +19,5 @@ PolicyName = Literal[
 ]
 """The scene's programme; ours, free to grasp anew or not, and within two procedures; the paper's."""
 POLICIES: tuple[PolicyName, ...] = get_args(PolicyName)
+PRIMITIVES: tuple[PolicyName, ...] = tuple(name for name in POLICIES if name.startswith("pmp-"))
+"""The paper's that pull one way and look at nothing."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jiggle_mj.estimator.outlook import Outlook, Tug, expected_fall
-from jiggle_mj.estimator.policies.information import at_once, outcomes
+from jiggle_mj.estimator.policies.outcomes import at_once, outcomes
 from jiggle_mj.estimator.spike_and_slab import Mixture
 from small_sheet import GRIP_RADIUS, NOISE, attached, corners, sheet, sheet_balance, sheet_prior
 

@@ -17,7 +17,7 @@ def tweezer() -> Tweezer:
 
 
 def lowest(tip: np.ndarray, quat: np.ndarray) -> float:
-    """Of the tool's surface, by MuJoCo and dense points on it."""
+    """Of the tool's surface, by MuJoCo and points on each capsule's axis."""
     model = mujoco.MjModel.from_xml_path(str(TWEEZER))
     data, found = mujoco.MjData(model), []
     data.mocap_pos[0], data.mocap_quat[0] = tip, quat

@@ -16,7 +16,7 @@ from jiggle_mj.recording import Recording
 from jiggle_mj.truth_recording import read_truth
 
 OUT = Path("docs/images/acting.webp")
-TOP = slice(60, 480), slice(100, 580)
+SHOWN = slice(60, 480), slice(100, 580)
 """Rows and columns of the image that are shown."""
 SCALE = 0.75
 """Of what is shown; pictures here are small."""
@@ -30,7 +30,8 @@ def frames(folder: Path) -> list[np.ndarray]:
     """Left images with particles coloured by P(attached), the true attachments ringed, the grip's way drawn."""
     recording, found = Recording.open(folder / "run.mcap"), read_estimate(folder / "estimate.mcap")
     truth = carry(found.sheet, read_truth(folder / "run.truth.mcap"), found.estimates[0].index)
-    estimates, drawn, ways, last = {one.index: one for one in found.estimates}, [], [], -2
+    estimates, drawn = {one.index: one for one in found.estimates}, []
+    ways: dict[int, list[np.ndarray]] = {}
     camera = recording.camera
     assert camera is not None
     for seen in recording:
@@ -38,20 +39,17 @@ def frames(folder: Path) -> list[np.ndarray]:
             continue
         one, image = estimates[seen.index], cv2.cvtColor(seen.images.left, cv2.COLOR_RGB2BGR)
         pixel = camera.project(one.positions)[:, :2].round().astype(int)
-        if one.index > last + 1:
-            ways.append([])
-        last = one.index
-        ways[-1].append(pixel[one.held].mean(axis=0).round().astype(int))
+        ways.setdefault(seen.tool.grasp, []).append(pixel[one.held].mean(axis=0).round().astype(int))
         level = (255 * np.clip(np.nan_to_num(one.probability), 0, 1)).astype(np.uint8)
         colour = cv2.applyColorMap(level[:, None], cv2.COLORMAP_VIRIDIS)[:, 0]
         for place, bgr, attached in zip(pixel.tolist(), colour.tolist(), truth.attached, strict=True):
             cv2.circle(image, place, 3, bgr, -1, cv2.LINE_AA)
             if attached:
                 cv2.circle(image, place, 5, WHITE, 1, cv2.LINE_AA)
-        cv2.polylines(image, [np.array(way) for way in ways], False, RED, 2, cv2.LINE_AA)
+        cv2.polylines(image, [np.array(way) for way in ways.values()], False, RED, 2, cv2.LINE_AA)
         words = f"frame {seen.index}: entropy {one.entropy:.0f} nat"
-        cv2.putText(image, words, (TOP[1].start + 10, TOP[0].start + 24), FONT, 0.6, WHITE, 1, cv2.LINE_AA)
-        drawn.append(cv2.resize(image[TOP], None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA))
+        cv2.putText(image, words, (SHOWN[1].start + 10, SHOWN[0].start + 24), FONT, 0.6, WHITE, 1, cv2.LINE_AA)
+        drawn.append(cv2.resize(image[SHOWN], None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA))
     return drawn
 
 

@@ -11,7 +11,6 @@ normal over the scenarios. Particles in the jaws and their neighbours, on which 
 free: inside the sheet no place is grasped that is not known to be, and the first is on its edge.
 """
 
-import math
 from itertools import product
 from statistics import NormalDist
 
@@ -19,12 +18,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.outlook import Outcome, Outlook, Tug
+from jiggle_mj.estimator.policies.outcomes import outcomes
 from jiggle_mj.estimator.policies.policy import STEP, Policy
 from jiggle_mj.estimator.policies.tweezer import Tweezer
 from jiggle_mj.estimator.policies.workspace import Workspace
@@ -67,6 +66,8 @@ DIRECTIONS = np.array(
     dtype=float,
 )
 """Up, along the sheet, and between."""
+PULLS = np.kron(DIRECTIONS, STEP * np.array(AHEAD)[:, None])
+"""Where the tip may be pulled from where it is [m]: every direction as far as `AHEAD` says, one after the other."""
 
 
 class Information(Policy):
@@ -165,13 +166,12 @@ class Information(Policy):
         def tugs(tips: Float[np.ndarray, "k 3"]) -> Tug:
             return self._tugs(estimator, hold.held, start, hold.closed_at + (tips - hold.tip)[:, None])
 
-        ahead, ways = (part.ravel() for part in np.meshgrid(AHEAD, np.arange(len(DIRECTIONS))))
-        ends = tool.position + STEP * ahead[:, None] * DIRECTIONS[ways]
+        ends, ahead = tool.position + PULLS, np.tile(AHEAD, len(DIRECTIONS))
         gain = self._allowed_gain(outcomes(outlook, tugs(ends), few)).mean(axis=1)
         rate = np.where(self._reached(estimator, ends), gain / np.maximum(ahead, 1), 0.0)
         best = [i for i in np.argsort(-rate)[:TRIED] if rate[i] > 0]
         for share, i in product(SHORTER, best):
-            tip = tool.position + share * STEP * min(ahead[i], 1) * DIRECTIONS[ways[i]]
+            tip = tool.position + share * STEP * min(ahead[i], 1) * DIRECTIONS[i // len(AHEAD)]
             if self._safe(outlook, tugs(tip[None]), many):
                 return tip, float(rate[i])
         return None
@@ -255,45 +255,6 @@ class Information(Policy):
 @eqx.filter_jit
 def _scenarios(outlook: Outlook, key: PRNGKeyArray, count: int, unknown: Float[Array, ""]) -> Float[Array, "count n"]:
     return outlook.scenarios(key, count, unknown=unknown)
-
-
-def outcomes(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
-    """Of each tug in each scenario: at once on GPUs, in turn on a CPU, where one compilation serves any number."""
-    if jax.default_backend() != "cpu":
-        return at_once(outlook, tugs, s, informative=informative)
-    each_tug = [jax.tree.map(lambda leaf, i=i: leaf[i], tugs) for i in range(len(tugs.to))]
-    found = [[_outcome(outlook, tug, one, informative=informative) for one in s] for tug in each_tug]
-    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *row) for row in found]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked)
-
-
-@eqx.filter_jit
-def _outcome(outlook: Outlook, tug: Tug, s: Float[Array, " n"], *, informative: bool) -> Outcome:
-    return outlook.outcome(tug, jnp.where(tug.loaded, 0.0, s), informative=informative)
-
-
-@eqx.filter_jit
-def at_once(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
-    """The same, the pairs of tug and scenario dealt out to all devices, each of which iterates for itself."""
-    shape, devices = (len(tugs.to), len(s)), jax.devices()
-    pairs = jnp.arange(-(-math.prod(shape) // len(devices)) * len(devices)) % math.prod(shape)
-    known, rest = eqx.partition((outlook, tugs, s), eqx.is_array)
-
-    def some(known: tuple, pairs: Int[Array, " some"]) -> Outcome:
-        outlook, tugs, s = eqx.combine(known, rest)
-
-        def one(pair: Int[Array, ""]) -> Outcome:
-            tug = jax.tree.map(lambda leaf: leaf[pair // len(s)], tugs)
-            return _outcome(outlook, tug, s[pair % len(s)], informative=informative)
-
-        return jax.vmap(one)(pairs)
-
-    dealt, everywhere = PartitionSpec("pairs"), PartitionSpec()
-    mesh = Mesh(np.array(devices), ("pairs",))
-    found = jax.shard_map(
-        some, mesh=mesh, in_specs=(everywhere, dealt), out_specs=dealt, check_vma=False
-    )(known, pairs)  # fmt: skip
-    return jax.tree.map(lambda leaf: leaf[: math.prod(shape)].reshape(*shape, *leaf.shape[1:]), found)
 
 
 def _spread(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " _count"]:

@@ -4,6 +4,7 @@ They see the tissue through the paper's simulator, with the stiffness of those p
 none elsewhere: the mean of a belief that knows little is a little stiffness everywhere, which no tissue has.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
 
@@ -78,9 +79,9 @@ class Controlled(Policy):
             return "no step lowers the loss"
         return Move(to=to), "the controller's step"
 
+    @abstractmethod
     def choose(self, simulator: XPBD, situation: Situation, workspace: Workspace) -> Float[Array, " 3"]:
         """Where the tip goes."""
-        raise NotImplementedError
 
     def _situation(self, estimator: Estimator) -> Situation:
         hold, detection, k = estimator.hold, estimator.detection, estimator.declaration.membrane_stiffness

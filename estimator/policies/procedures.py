@@ -3,6 +3,7 @@
 Both look with our policy, act, and look again: an act is checked by what the frames after it say, not taken on trust.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 
 import numpy as np
@@ -52,9 +53,9 @@ class Procedure(Policy):
         self._look, self._steps = self._fresh(enough=CHECKED), 0
         return act, planned
 
+    @abstractmethod
     def act(self, estimator: Estimator) -> Action | str:
         """What to do now that the jaws are open and the tissue was looked at; or why nothing."""
-        raise NotImplementedError
 
 
 class Detach(Procedure):
