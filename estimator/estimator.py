@@ -143,8 +143,11 @@ class Estimator:
         self._check_begun()
         return self._field.widened(held)
 
-    def outlook(self) -> Outlook:
+    def outlook(self, about: Bool[np.ndarray, " n"] | None = None) -> Outlook:
         """What pulls would show and cost, as far as is believed now; `release` first, once a grasp is over.
+
+        Args:
+            about: particles whose attachments are asked about; all if None.
 
         Raises:
             ValueError: asked before `begin`, or of another filter than 'implicit'.
@@ -152,7 +155,9 @@ class Estimator:
         self._check_begun()
         implicit, belief = self._implicit("predicts pulls")
         position = 1.0 if implicit.noise is None else implicit.noise.position
-        return Outlook(balance=implicit.balance, belief=belief, precision=jnp.asarray(self._sight / position))
+        asked = jnp.ones(len(self._x), dtype=bool) if about is None else jnp.asarray(about)
+        sight = jnp.asarray(self._sight / position)
+        return Outlook(balance=implicit.balance, belief=belief, precision=sight, about=asked)
 
     @property
     def belief(self) -> Belief:

@@ -8,7 +8,8 @@ particles are, not on what is read off them:
 
 is what a Gaussian belief would gain. Ours is not Gaussian: a particle is free or attached, and a look that just tells
 the two apart teaches far more than its precision says. So the look is taken as one measurement of each particle's s, as
-precise as it makes what is known of it, and the gain is the expected fall of 1/2 ln of that s's variance, summed.
+precise as it makes what is known of it, and the gain is the expected fall of 1/2 ln of that s's variance, summed over
+the particles that are asked about.
 
 An attachment that nobody knows of yet is in some scenarios and not in others: a risk as well as a hope. How stiff it
 may be, from hardly felt to a weld, would forbid every first pull; so it counts with at most a stiffness that somebody
@@ -59,6 +60,8 @@ class Outlook(eqx.Module):
     belief: AttachmentBelief
     precision: Float[Array, "3 3"]
     """Inverse covariance of a seen particle [1/m^2]."""
+    about: Bool[Array, " n"]
+    """Particles whose s is worth knowing."""
 
     def scenarios(self, key: PRNGKeyArray, count: int, *, unknown: float | Array) -> Float[Array, "count n"]:
         """Draws of s: free, or on which rung, for each particle by itself, then all s together given that.
@@ -85,12 +88,12 @@ class Outlook(eqx.Module):
         return jax.lax.map(lambda drawn: one(*drawn), (states, noise))
 
     def gain(self, precision: Float[Array, "n n"]) -> Float[Array, ""]:
-        """Expected fall of the belief's entropy by evidence about s of that precision [nat]."""
+        """Expected fall of the entropy of what is asked about, by evidence about s of that precision [nat]."""
         before, mixture = self.belief.precision + jnp.diag(self.belief.site_precision), self.belief.mixture()
         known = jnp.sum(lower_inverse(jnp.linalg.cholesky(before)) ** 2, axis=0)
         better = jnp.sum(lower_inverse(jnp.linalg.cholesky(before + precision)) ** 2, axis=0)
         noise = 1 / jnp.maximum(1 / better - 1 / known, FAINT)
-        return jnp.sum(expected_fall(mixture, noise))
+        return jnp.sum(jnp.where(self.about, expected_fall(mixture, noise), 0.0))
 
     def outcome(self, tug: Tug, s: Float[Array, " n"], *, informative: bool = True) -> Outcome:
         """Of a tug in a scenario; the gain costs as much as the rest, and is 0 where it is not asked for."""

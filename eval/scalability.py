@@ -43,7 +43,8 @@ def our_plan(one: Case) -> Callable[[], object]:
     """What `Information` asks of a grasp: what pulls teach, and whether the best is safe."""
     filter, belief = build_filter(one.mesh, one.declaration, EstimatorConfig())
     assert isinstance(filter, ImplicitFilter) and isinstance(belief, AttachmentBelief)
-    outlook = Outlook(balance=filter.balance, belief=belief, precision=jnp.eye(3) / NOISE**2)
+    everywhere = jnp.ones(len(belief.shift), dtype=bool)
+    outlook = Outlook(balance=filter.balance, belief=belief, precision=jnp.eye(3) / NOISE**2, about=everywhere)
     pull, held = one.frames[-1].pull, one.frames[-1].held
     assert pull is not None
     ends = pull.before[None] + jnp.asarray(PULLS)[:, None]

@@ -29,6 +29,8 @@ CHANCE = (1,)
 """Sets the failures of cuts and sutures apart from the noise of sensing."""
 WIDEST, REACH = 0.05, 1.0
 """Largest radius of the jaws, and how far from the middle of the sheet the tip may go along each axis [m]."""
+SUNK = 5e-3
+"""How far below the bed the tip may be sent, as what is seen may seem to lie too low; it stops on the bed [m]."""
 WAIT_STEPS = 5
 """Steps of a Wait before the tissue may be found at rest: still frames are a little more than 0.1 s apart."""
 
@@ -174,7 +176,7 @@ class Reference:
                 f"grasp at {_text(point)} m meets welded vertices only, and a weld does not yield to the jaws. "
                 "Grasp elsewhere or widen the radius."
             )
-        self._simulation.jaws.tip = point
+        self._simulation.jaws.tip = self._above_bed(point)
         self._simulation.jaws.close(np.flatnonzero(inside))
         self._observer.jaws_closed()
         self._grasp, self._radius, self._closed = self._grasp + 1, float(action.radius), True
@@ -187,19 +189,23 @@ class Reference:
 
     def _move(self, action: Move) -> None:
         to = _finite(action.to, name="Move.to")
-        lowest = 0.0 if self.scene.bed.present else -REACH
+        lowest = -SUNK if self.scene.bed.present else -REACH
         if np.abs(to).max() > REACH or to[2] < lowest:
             raise ActionError(
                 f"Move.to = {_text(to)} m is out of reach: each coordinate must be within {REACH:g} m, and z at least "
                 f"{lowest:g} m. Lengths are in metres."
             )
-        start = self._simulation.jaws.tip
+        start, to = self._simulation.jaws.tip, self._above_bed(to)
         n_steps = max(math.ceil(np.linalg.norm(to - start) / (self.scene.tweezer.speed * TIMESTEP)), 1)
         if not self._closed:
             n_steps = 1
         for k in range(1, n_steps + 1):
             self._simulation.jaws.tip = start + (to - start) * k / n_steps
             self._simulation.step()
+
+    def _above_bed(self, point: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+        """The point, or where a tip on its way down there meets the bed."""
+        return np.array([*point[:2], max(point[2], 0.0)]) if self.scene.bed.present else point
 
     def _settle(self) -> bool:
         settled = self._simulation.settle()

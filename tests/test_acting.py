@@ -156,11 +156,12 @@ def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, mo
     assert figures["procedure"] is None
 
 
-class Corners(Policy):
+class Corners(Information):
     """Four corner lifts, wherever the corners lie, in place of looks that take minutes."""
 
     def __init__(self):
-        super().__init__()
+        Policy.__init__(self)
+        self.regrasps = False
         ways = ((-1, -1), (1, -1), (1, 1), (-1, 1))
         self._left = [(way, height) for way in ways for height in (None, 0.01, 0.02, 0.03, 0.0, "open")]
 

@@ -16,6 +16,7 @@ from small_sheet import GRIP_RADIUS, NOISE, attached, corners, sheet, sheet_bala
 
 SIGHT = jnp.eye(3) / NOISE**2
 KNOWN = 0.09
+ALL = jnp.ones(sheet().n, dtype=bool)
 
 
 @pytest.fixture(scope="module")
@@ -26,13 +27,21 @@ def outlook() -> Outlook:
     belief = belief.add(precision, precision @ jnp.where(attached(), KNOWN, 0.0))
     for _ in range(20):
         belief = belief.sweep(belief.gaussian())
-    return Outlook(balance=sheet_balance(1e-4), belief=belief, precision=SIGHT)
+    return Outlook(balance=sheet_balance(1e-4), belief=belief, precision=SIGHT, about=ALL)
 
 
 def lift(height: float) -> Tug:
     held = np.linalg.norm(sheet().rest - corners()[0], axis=1) <= GRIP_RADIUS
     rest, held = jnp.asarray(sheet().rest), jnp.asarray(held)
     return Tug(start=rest, held=held, loaded=held, to=rest + jnp.array([[0.0, 0.0, height]]))
+
+
+def test_what_is_asked_about_adds_up_to_all(outlook):
+    precision = jnp.eye(sheet().n) / 0.02**2
+    near = jnp.asarray(np.linalg.norm(sheet().rest, axis=1) < 10e-3)
+    parts = [eqx.tree_at(lambda one: one.about, outlook, about).gain(precision) for about in (near, ~near)]
+    assert min(parts) > 0
+    np.testing.assert_allclose(sum(parts), outlook.gain(precision), rtol=1e-12)
 
 
 def test_the_expected_fall_is_that_of_simulated_measurements():
@@ -111,7 +120,7 @@ def test_pulls_dealt_out_to_two_devices_have_the_outcomes_of_one():
 def _dealt() -> None:
     """Three pulls in three scenarios: nine pairs, which two devices cannot share evenly."""
     belief = sheet_prior()
-    predicted = Outlook(balance=sheet_balance(1e-4), belief=belief, precision=SIGHT)
+    predicted = Outlook(balance=sheet_balance(1e-4), belief=belief, precision=SIGHT, about=ALL)
     s = predicted.scenarios(jax.random.key(0), 3, unknown=1.0)
     tugs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(lift, (0.005, 0.01, 0.015)))
     together, apart = (of(predicted, tugs, s, informative=False) for of in (at_once, outcomes))

@@ -1,8 +1,14 @@
-"""Where a procedure cuts and sews: tours by hand, and the free stretch of a sheet with one attached line."""
+"""Where a procedure cuts and sews, and how long it looks at what it sewed."""
 
 import numpy as np
-from jiggle_mj.estimator.policies.procedures import free_stretch, tour
+import pytest
+from jiggle_mj.estimator.estimator import Estimator
+from jiggle_mj.estimator.policies.information import Information
+from jiggle_mj.estimator.policies.procedures import CERTAIN, CYCLE, Sew, free_stretch, tour
 from small_sheet import sheet
+
+from jiggle_mj.estimate import Detection, Sheet
+from jiggle_mj.observation import Move, Suture
 
 LENGTH, WIDTH = 0.02, 7e-3
 
@@ -28,3 +34,73 @@ def test_the_surest_free_stretch_lies_where_nothing_is_attached():
 def test_where_nothing_is_known_to_be_free_there_is_none():
     assert stretch(np.full(sheet().n, 0.3)) is None
     assert stretch(np.full(sheet().n, 0.0)) is not None
+
+
+class Looking(Information):
+    """Moves until it is told to leave."""
+
+    def __init__(self, *, enough=None, about=None):
+        self.about, self.over = about, ""
+
+    def leave(self, why):
+        self.over = why
+
+    def plan(self, estimator):
+        return self.over or (Move(to=np.zeros(3)), "it teaches")
+
+
+class Seen(Estimator):
+    """Believes that all is free; what it saw of a suture after each step is told beforehand."""
+
+    def __init__(self, factors):
+        self.changes, self.factors = [], list(factors)
+
+    @property
+    def sheet(self):
+        return Sheet(rest=sheet().rest, faces=sheet().faces)
+
+    @property
+    def detection(self):
+        free = np.zeros(sheet().n)
+        return Detection(attached=free > 0, score=free, stiffness=free, stiffness_sd=free, rule="nothing is")
+
+    def release(self):
+        pass
+
+    def worked(self, change):
+        return self.factors.pop(0) if len(self.factors) > 1 else self.factors[0]
+
+
+def sewing(*factors):
+    """What a procedure plans, how it ends, and which particles it asked about after the suture."""
+    looks = []
+
+    def look(**asked):
+        looks.append(Looking(**asked))
+        return looks[-1]
+
+    estimator, sew, planned = Seen(factors), Sew(look, length=LENGTH, width=WIDTH, stiffness=1.0), []
+    for _ in range(3 * CYCLE):
+        one = sew.plan(estimator)
+        if isinstance(one, str):
+            return planned, one, looks[-1].about
+        planned.append(one[0])
+        if isinstance(one[0], Suture):
+            estimator.changes.append(one[0])
+    raise AssertionError("no end")
+
+
+@pytest.mark.parametrize(("sign", "said"), [(1, "the suture holds"), (-1, "the suture does not hold")])
+def test_a_suture_is_looked_at_until_it_is_known_whether_it_holds(sign, said):
+    planned, why, about = sewing(None, sign * (CERTAIN - 1), sign * (CERTAIN + 1))
+    assert isinstance(planned[CYCLE], Suture)
+    assert len(planned) == CYCLE + 1 + 2
+    assert why == f"{said}; what was done is seen"
+    band = np.linalg.norm(sheet().rest[about, :2] - np.mean(planned[CYCLE].path, axis=0), axis=1)
+    assert 0 < len(band) < sheet().n and band.max() <= (LENGTH + WIDTH) / 2
+
+
+def test_a_suture_that_is_not_surely_seen_is_looked_at_for_a_cycle():
+    planned, why, _ = sewing(CERTAIN / 2)
+    assert len(planned) == 2 * CYCLE + 1
+    assert why == "the suture holds; the steps of this cycle are done"

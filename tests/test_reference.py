@@ -286,6 +286,16 @@ def test_actions_with_impossible_numbers_are_refused(action):
         particles().step(action)
 
 
+def test_a_tip_sent_a_little_below_the_bed_stops_on_it():
+    below = CORNER * (1, 1, -1)
+    reference = particles()
+    grasped = reference.step(Grasp(point=below, radius=8e-3)).tool
+    reference.step(Move(to=CORNER + np.array([0.0, 0.0, 0.01])))
+    lowered = reference.step(Move(to=below)).tool
+    for tool in (grasped, lowered):
+        np.testing.assert_allclose(tool.position, [*below[:2], 0.0], atol=1e-12)
+
+
 @pytest.mark.parametrize("action", ["grasp", Wait, None])
 def test_what_is_no_action_is_refused(action):
     with pytest.raises(ActionError, match="step takes a Grasp, Move, Release, Wait, Cut or Suture; got"):

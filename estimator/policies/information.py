@@ -82,6 +82,7 @@ class Information(Policy):
         tweezer: Tweezer | None = None,
         regrasps: bool = True,
         enough: float = ENOUGH,
+        about: Bool[np.ndarray, " n"] | None = None,
     ) -> None:
         """Say what is allowed.
 
@@ -92,9 +93,10 @@ class Information(Policy):
             tweezer: kept clear of the bed; if None, nothing but the tip is known of the tool.
             regrasps: whether to let go and grasp elsewhere; if not, the jaws are closed by somebody else.
             enough: a gain for which no step is worth taking [nat per particle].
+            about: particles whose attachments are asked about; all if None.
         """
         super().__init__()
-        self.regrasps, self._enough = regrasps, enough
+        self.regrasps, self._enough, self._about = regrasps, enough, about
         self._limits, self._radius, self._tweezer, self._key = limits, radius, tweezer, jax.random.key(seed)
         self._energy, self._force = MARGIN * limits.energy, MARGIN * limits.force
         self._worth: dict[int, float] = {}
@@ -109,7 +111,7 @@ class Information(Policy):
         estimator.begin()
         with jax.enable_x64(True), one_thread():
             hold, tool = estimator.hold, estimator.tool
-            outlook = estimator.outlook()
+            outlook = estimator.outlook(self._about)
             if tool is None or not tool.closed:
                 return self._grasp(estimator, outlook) if self.regrasps else self._leaving or "nothing is grasped"
             if hold is None:
@@ -145,7 +147,7 @@ class Information(Policy):
         if self._over:
             return self._over
         probability = np.asarray(outlook.belief.mixture().attached)
-        unsure = np.minimum(probability, 1 - probability) > DECIDED
+        unsure = np.asarray(outlook.about) & (np.minimum(probability, 1 - probability) > DECIDED)
         if not unsure.any():
             return f"enough is known: every P(attached) is below {DECIDED:g} or above {1 - DECIDED:g}"
         enough, self._worth = self._enough * len(unsure), dict.fromkeys(self._worth, np.inf)

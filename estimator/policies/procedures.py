@@ -12,6 +12,7 @@ from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.policies.information import Information
 from jiggle_mj.estimator.policies.policy import Policy
+from jiggle_mj.estimator.topology import region_of
 
 from jiggle_mj.observation import Action, Cut, Suture
 from jiggle_mj.regions import distance_to_path
@@ -19,7 +20,10 @@ from jiggle_mj.regions import distance_to_path
 CYCLE = 40
 """Most steps of looking before an act, and after the last."""
 CHECKED = 0.002
-"""A gain for which no step is worth taking once an act is to be checked [nat per particle]."""
+"""A gain for which no step is worth taking once something was cut [nat per particle]."""
+CERTAIN = 20.0
+"""Log Bayes factor, either way, from which an act is known to have worked or failed. A model that errs exaggerates it:
+a lift that shows the place gives 55 and more."""
 ROOM = 2.4
 """Width of a cut [spacings]: the particles on its path and a ring around them, as well as an attachment is located."""
 FREE = 0.2
@@ -32,7 +36,7 @@ class Procedure(Policy):
     name: str
 
     def __init__(self, look: Callable[..., Information]) -> None:
-        """`look` makes a fresh policy for each time the tissue is looked at; may be told how much is `enough`."""
+        """`look` makes a fresh policy for each look at the tissue; takes `Information`'s `enough` and `about`."""
         super().__init__()
         self._fresh = look
         self._look, self._steps, self.acts = look(), 0, 0
@@ -41,6 +45,8 @@ class Procedure(Policy):
         """See `Policy.plan`."""
         if self._steps >= CYCLE:
             self._look.leave("the steps of this cycle are done")
+        elif self.acts and self.seen(estimator):
+            self._look.leave("what was done is seen")
         planned = self._look.plan(estimator)
         if not isinstance(planned, str):
             self._steps += 1
@@ -50,12 +56,20 @@ class Procedure(Policy):
         if isinstance(act, str):
             return f"{act}; {planned}"
         self.acts += 1
-        self._look, self._steps = self._fresh(enough=CHECKED), 0
+        self._look, self._steps = self.check(estimator, act), 0
         return act, planned
 
     @abstractmethod
-    def act(self, estimator: Estimator) -> Action | str:
+    def act(self, estimator: Estimator) -> Cut | Suture | str:
         """What to do now that the jaws are open and the tissue was looked at; or why nothing."""
+
+    @abstractmethod
+    def check(self, estimator: Estimator, act: Cut | Suture) -> Information:
+        """Who looks at the tissue after an act."""
+
+    def seen(self, estimator: Estimator) -> bool:
+        """Whether nothing more has to be seen of the last act."""
+        return False
 
 
 class Detach(Procedure):
@@ -63,13 +77,17 @@ class Detach(Procedure):
 
     name = "detach"
 
-    def act(self, estimator: Estimator) -> Action | str:
+    def act(self, estimator: Estimator) -> Cut | Suture | str:
         """See `Procedure.act`."""
         found = estimator.detection.attached
         if not found.any():
             return "nothing is attached any more"
         mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
         return Cut(path=tour(mesh.rest[found, :2]), width=ROOM * mesh.spacing)
+
+    def check(self, estimator: Estimator, act: Cut | Suture) -> Information:
+        """See `Procedure.check`: whatever is still attached counts."""
+        return self._fresh(enough=CHECKED)
 
 
 class Sew(Procedure):
@@ -82,7 +100,7 @@ class Sew(Procedure):
         super().__init__(look)
         self._length, self._width, self._stiffness = length, width, stiffness
 
-    def act(self, estimator: Estimator) -> Action | str:
+    def act(self, estimator: Estimator) -> Cut | Suture | str:
         """See `Procedure.act`."""
         if self.acts:
             factor = estimator.worked(estimator.changes[-1])
@@ -94,6 +112,15 @@ class Sew(Procedure):
         if path is None:
             return f"no stretch of {1e3 * self._length:.0f} mm is known to be free"
         return Suture(path=path, width=self._width, stiffness=self._stiffness)
+
+    def check(self, estimator: Estimator, act: Cut | Suture) -> Information:
+        """See `Procedure.check`: what was sewn, until it is known whether it holds."""
+        return self._fresh(enough=0.0, about=region_of(act, estimator.sheet.rest))
+
+    def seen(self, estimator: Estimator) -> bool:
+        """See `Procedure.seen`."""
+        factor = estimator.worked(estimator.changes[-1]) if estimator.changes else None
+        return factor is not None and abs(factor) >= CERTAIN
 
 
 def tour(points: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
