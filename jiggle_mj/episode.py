@@ -107,7 +107,7 @@ def observe(
     policy: str = "",
     overwrite: bool = False,
     watch: Stopwatch | None = None,
-    on_refused: Callable[[ActionError], None] | None = None,
+    on_refused: Callable[[ActionError], bool] | None = None,
 ) -> Iterator[Observation]:
     """Carry out actions on the reference tissue, one observation each but where a frame was lost.
 
@@ -119,7 +119,8 @@ def observe(
         policy: who chooses the actions, with all that it depends on; empty for the scene's programme.
         overwrite: replace files that are there.
         watch: adds up the time of the simulation.
-        on_refused: told of an action that cannot be carried out, which is the end; if None, it is raised.
+        on_refused: told of an action that cannot be carried out, and says whether there is another; if None, it is
+            raised.
     """
     watch = watch or Stopwatch()
     with ExitStack() as files:
@@ -156,7 +157,8 @@ def observe(
             except ActionError as refused:
                 if on_refused is None:
                     raise
-                on_refused(refused)
+                if on_refused(refused):
+                    continue
                 break
             if observation.lost:
                 continue

@@ -16,12 +16,12 @@ from jiggle_mj.scenes import Reference, load_scene
 from result_keys import KEYS, keys
 from tiny_scene import SCENE, call, scene_file
 
-from jiggle_mj.errors import OptionError
+from jiggle_mj.errors import ActionError, OptionError
 from jiggle_mj.limits import Limits
 from jiggle_mj.observation import Action, Declaration, Grasp, Move, Release, Wait
 from jiggle_mj.policies import POLICIES
 
-PAPERS = ("sl-d", "lg-d", "lg-h", "pmp-up", "pmp-left")
+PAPERS = ("sl-d", "pmp-up", pytest.param("lg-d", marks=pytest.mark.slow), pytest.param("lg-h", marks=pytest.mark.slow))
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +159,8 @@ def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, mo
 class Corners(Information):
     """Four corner lifts, wherever the corners lie, in place of looks that take minutes."""
 
+    refused = Policy.refused
+
     def __init__(self):
         Policy.__init__(self)
         self.regrasps = False
@@ -208,6 +210,24 @@ def test_a_grasp_that_misses_ends_the_run_and_loses_nothing(scene, tmp_path, mon
     figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="information")
     assert figures["ended"].startswith("an action could not be carried out: grasp at")
     assert figures["detection"]["n_attached"] > 0 and (tmp_path / "out" / "report.html").exists()
+
+
+def test_where_a_grasp_of_ours_has_missed_it_grasps_elsewhere(scene, tmp_path, monkeypatch):
+    """What it takes for tissue is none: the first grasp meets nothing."""
+    tried: list[np.ndarray] = []
+    step = Reference.step
+
+    def misses_first(self, action):
+        if isinstance(action, Grasp):
+            tried.append(action.point)
+            if len(tried) == 1:
+                raise ActionError("it holds nothing")
+        return step(self, action)
+
+    monkeypatch.setattr(Reference, "step", misses_first)
+    figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="information", steps=3)
+    assert len(tried) == 2 and np.linalg.norm(tried[1] - tried[0]) > 8e-3
+    assert figures["ended"] == "all 3 steps are done"
 
 
 def test_options_that_do_not_fit_are_refused(scene):

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.estimator.policies.information import Information
+from jiggle_mj.estimator.policies.policy import Decision
 from jiggle_mj.estimator.policies.procedures import CERTAIN, CYCLE, Sew, free_stretch, tour
 from small_sheet import sheet
 
+from jiggle_mj.errors import ActionError
 from jiggle_mj.estimate import Detection, Sheet
-from jiggle_mj.observation import Move, Suture
+from jiggle_mj.observation import Grasp, Move, Suture
 
 LENGTH, WIDTH = 0.02, 7e-3
 
@@ -47,6 +49,13 @@ class Looking(Information):
 
     def plan(self, estimator):
         return self.over or (Move(to=np.zeros(3)), "it teaches")
+
+
+class Misses(Looking):
+    """Goes on, whatever was refused."""
+
+    def refused(self, error):
+        return True
 
 
 class Seen(Estimator):
@@ -104,3 +113,15 @@ def test_a_suture_that_is_not_surely_seen_is_looked_at_for_a_cycle():
     planned, why, _ = sewing(CERTAIN / 2)
     assert len(planned) == 2 * CYCLE + 1
     assert why == "the suture holds; the steps of this cycle are done"
+
+
+def test_what_cannot_be_sewn_is_the_end_but_a_grasp_that_misses_is_for_who_looks():
+    procedure = Sew(Misses, length=LENGTH, width=WIDTH, stiffness=1.0)
+    point = np.zeros(3)
+    for action, goes_on in (
+        (Grasp(point=point, radius=8e-3), True),
+        (Suture(path=point[None, :2], width=WIDTH, stiffness=1.0), False),
+    ):
+        procedure.decisions.append(Decision(action=action, plan_s=0.0, why=""))
+        assert procedure.refused(ActionError("nothing is there")) is goes_on
+    assert procedure.ended == "an action could not be carried out: nothing is there"

@@ -28,6 +28,7 @@ from jiggle_mj.estimator.policies.policy import STEP, Policy
 from jiggle_mj.estimator.policies.tweezer import Tweezer
 from jiggle_mj.estimator.policies.workspace import Workspace
 
+from jiggle_mj.errors import ActionError
 from jiggle_mj.limits import Limits
 from jiggle_mj.observation import Action, Grasp, Move, Release
 
@@ -100,14 +101,24 @@ class Information(Policy):
         self._limits, self._radius, self._tweezer, self._key = limits, radius, tweezer, jax.random.key(seed)
         self._energy, self._force = MARGIN * limits.energy, MARGIN * limits.force
         self._worth: dict[int, float] = {}
+        self._place: int | None = None
+        self._missed: set[int] = set()
         self._leaving = self._over = ""
 
     def leave(self, why: str) -> None:
         """Plan no more than what it takes to let go."""
         self._over = why
 
+    def refused(self, error: ActionError) -> bool:
+        """See `Policy.refused`: where the jaws have missed the tissue, they are not closed again."""
+        if self._place is None:
+            return super().refused(error)
+        self._missed.add(self._place)
+        return True
+
     def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
         """See `Policy.plan`."""
+        self._place = None
         estimator.begin()
         with jax.enable_x64(True), one_thread():
             hold, tool = estimator.hold, estimator.tool
@@ -156,6 +167,7 @@ class Information(Policy):
             return "no place of the sheet is within the tool's reach"
         if place is None:
             return f"no safe pull teaches {enough:.2g} nat a step; {int(unsure.sum())} of {len(unsure)} are not decided"
+        self._place = place
         return Grasp(point=estimator.positions[place], radius=self._radius), f"{self._worth[place]:.0f} nat a step"
 
     def _best_pull(self, estimator: Estimator, outlook: Outlook) -> tuple[Float[np.ndarray, " 3"], float] | None:
@@ -202,7 +214,8 @@ class Information(Policy):
             fresh.add(best)
             at_hand = here is not None and np.linalg.norm(rest[best] - here) < self._radius
             suspect = probability[estimator.loaded(held)].max() > (SUSPECTED if self._edge[best] else KNOWN)
-            self._worth[best] = 0.0 if at_hand or suspect else self._lifted(estimator, outlook, held, few)
+            barred = at_hand or suspect or best in self._missed
+            self._worth[best] = 0.0 if barred else self._lifted(estimator, outlook, held, few)
         return None
 
     def _lifted(

@@ -46,9 +46,14 @@ class Policy(ABC):
             estimator: after the latest observation.
         """
 
-    def refused(self, error: ActionError) -> None:
-        """Say that the last action, a grasp beside the tissue for example, could not be carried out; it is the end."""
+    def refused(self, error: ActionError) -> bool:
+        """Hear that the last action could not be carried out, and say whether to go on; by default it is the end.
+
+        Args:
+            error: why not.
+        """
         self.ended = f"an action could not be carried out: {error}"
+        return False
 
     def actions(self, estimator: Estimator, *, steps: int) -> Iterator[Action]:
         """At most `steps` actions; an interrupted plan (Ctrl-C) is the end of them, and what was seen is kept."""

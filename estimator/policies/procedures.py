@@ -14,6 +14,7 @@ from jiggle_mj.estimator.policies.information import Information
 from jiggle_mj.estimator.policies.policy import Policy
 from jiggle_mj.estimator.topology import region_of
 
+from jiggle_mj.errors import ActionError
 from jiggle_mj.observation import Action, Cut, Suture
 from jiggle_mj.regions import distance_to_path
 
@@ -58,6 +59,11 @@ class Procedure(Policy):
         self.acts += 1
         self._look, self._steps = self.check(estimator, act), 0
         return act, planned
+
+    def refused(self, error: ActionError) -> bool:
+        """See `Policy.refused`: who looks may go on; what could not be cut or sewn is the end."""
+        looked = not isinstance(self.decisions[-1].action, Cut | Suture)
+        return (looked and self._look.refused(error)) or super().refused(error)
 
     @abstractmethod
     def act(self, estimator: Estimator) -> Cut | Suture | str:
