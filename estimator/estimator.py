@@ -157,7 +157,7 @@ class Estimator:
         position = 1.0 if implicit.noise is None else implicit.noise.position
         asked = jnp.ones(len(self._x), dtype=bool) if about is None else jnp.asarray(about)
         sight = jnp.asarray(self._sight / position)
-        return Outlook(balance=implicit.balance, belief=belief, precision=sight, about=asked)
+        return Outlook.build(implicit.balance, belief, sight, asked)
 
     @property
     def belief(self) -> Belief:

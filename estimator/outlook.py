@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief, Gaussian
 from jiggle_mj.estimator.block_tridiagonal import lower_inverse
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
@@ -62,14 +62,36 @@ class Outlook(eqx.Module):
     """Inverse covariance of a seen particle [1/m^2]."""
     about: Bool[Array, " n"]
     """Particles whose s is worth knowing."""
+    mixture: Mixture
+    """The belief's, of each particle's s."""
+    known: Float[Array, " n"]
+    """Variance that the belief's Gaussian leaves of each s."""
+
+    @classmethod
+    def build(
+        cls,
+        balance: ForceBalance,
+        belief: AttachmentBelief,
+        precision: Float[Array, "3 3"],
+        about: Bool[Array, " n"],
+    ) -> "Outlook":
+        """With what does not depend on the pull worked out once."""
+        mixture, gaussian = _believed(belief)
+        return cls(
+            balance=balance,
+            belief=belief,
+            precision=precision,
+            about=about,
+            mixture=mixture,
+            known=gaussian.variance,
+        )
 
     def scenarios(self, key: PRNGKeyArray, count: int, *, unknown: float | Array) -> Float[Array, "count n"]:
         """Draws of s: free, or on which rung, for each particle by itself, then all s together given that.
 
         None is stiffer than `unknown` [N/m], unless it is as likely above as below more.
         """
-        belief = self.belief
-        mixture = belief.mixture()
+        belief, mixture = self.belief, self.mixture
         weight = mixture.weight
         most = jnp.maximum(belief.bounded(jnp.asarray(unknown)[None]), mixture.quantile(0.5))
         prior = belief.prior.stiffness
@@ -89,11 +111,10 @@ class Outlook(eqx.Module):
 
     def gain(self, precision: Float[Array, "n n"]) -> Float[Array, ""]:
         """Expected fall of the entropy of what is asked about, by evidence about s of that precision [nat]."""
-        before, mixture = self.belief.precision + jnp.diag(self.belief.site_precision), self.belief.mixture()
-        known = jnp.sum(lower_inverse(jnp.linalg.cholesky(before)) ** 2, axis=0)
+        before = self.belief.precision + jnp.diag(self.belief.site_precision)
         better = jnp.sum(lower_inverse(jnp.linalg.cholesky(before + precision)) ** 2, axis=0)
-        noise = 1 / jnp.maximum(1 / better - 1 / known, FAINT)
-        return jnp.sum(jnp.where(self.about, expected_fall(mixture, noise), 0.0))
+        noise = 1 / jnp.maximum(1 / better - 1 / self.known, FAINT)
+        return jnp.sum(jnp.where(self.about, expected_fall(self.mixture, noise), 0.0))
 
     def outcome(self, tug: Tug, s: Float[Array, " n"], *, informative: bool = True) -> Outcome:
         """Of a tug in a scenario; the gain costs as much as the rest, and is 0 where it is not asked for."""
@@ -109,6 +130,11 @@ class Outlook(eqx.Module):
         b = balance.reference * s / (1 - s)
         squared = jnp.sum((x - balance.energy.rest) ** 2, axis=1)
         return Outcome(x=x, gain=gain, energy=0.5 * b @ squared / n, force=jnp.max(b * jnp.sqrt(squared)))
+
+
+@eqx.filter_jit
+def _believed(belief: AttachmentBelief) -> tuple[Mixture, Gaussian]:
+    return belief.mixture(), belief.gaussian()
 
 
 def expected_fall(mixture: Mixture, noise: Float[Array, " n"]) -> Float[Array, " n"]:

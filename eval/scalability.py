@@ -44,7 +44,7 @@ def our_plan(one: Case) -> Callable[[], object]:
     filter, belief = build_filter(one.mesh, one.declaration, EstimatorConfig())
     assert isinstance(filter, ImplicitFilter) and isinstance(belief, AttachmentBelief)
     everywhere = jnp.ones(len(belief.shift), dtype=bool)
-    outlook = Outlook(balance=filter.balance, belief=belief, precision=jnp.eye(3) / NOISE**2, about=everywhere)
+    outlook = Outlook.build(filter.balance, belief, jnp.eye(3) / NOISE**2, everywhere)
     pull, held = one.frames[-1].pull, one.frames[-1].held
     assert pull is not None
     ends = pull.before[None] + jnp.asarray(PULLS)[:, None]

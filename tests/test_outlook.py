@@ -27,7 +27,7 @@ def outlook() -> Outlook:
     belief = belief.add(precision, precision @ jnp.where(attached(), KNOWN, 0.0))
     for _ in range(20):
         belief = belief.sweep(belief.gaussian())
-    return Outlook(balance=sheet_balance(1e-4), belief=belief, precision=SIGHT, about=ALL)
+    return Outlook.build(sheet_balance(1e-4), belief, SIGHT, ALL)
 
 
 def lift(height: float) -> Tug:
@@ -120,7 +120,7 @@ def test_pulls_dealt_out_to_two_devices_have_the_outcomes_of_one():
 def _dealt() -> None:
     """Three pulls in three scenarios: nine pairs, which two devices cannot share evenly."""
     belief = sheet_prior()
-    predicted = Outlook(balance=sheet_balance(1e-4), belief=belief, precision=SIGHT, about=ALL)
+    predicted = Outlook.build(sheet_balance(1e-4), belief, SIGHT, ALL)
     s = predicted.scenarios(jax.random.key(0), 3, unknown=1.0)
     tugs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(lift, (0.005, 0.01, 0.015)))
     together, apart = (of(predicted, tugs, s, informative=False) for of in (at_once, outcomes))

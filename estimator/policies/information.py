@@ -44,6 +44,8 @@ TRIED = 3
 """Pulls, best first, that are looked at for a safe one."""
 EXPECTED, JUDGED = 2, 16
 """Scenarios that a gain is the mean of, and that a step's safety is judged by."""
+LIKELY = 9
+"""Pulls, best in one scenario, that are looked at in all of them."""
 ENOUGH = 0.004
 """A gain for which no step is worth taking [nat per particle]."""
 MARGIN = 0.75
@@ -157,7 +159,7 @@ class Information(Policy):
         self._leaving = ""
         if self._over:
             return self._over
-        probability = np.asarray(outlook.belief.mixture().attached)
+        probability = np.asarray(outlook.mixture.attached)
         unsure = np.asarray(outlook.about) & (np.minimum(probability, 1 - probability) > DECIDED)
         if not unsure.any():
             return f"enough is known: every P(attached) is below {DECIDED:g} or above {1 - DECIDED:g}"
@@ -181,8 +183,16 @@ class Information(Policy):
             return self._tugs(estimator, hold.held, start, hold.closed_at + (tips - hold.tip)[:, None])
 
         ends, ahead = tool.position + PULLS, np.tile(AHEAD, len(DIRECTIONS))
-        gain = self._allowed_gain(outcomes(outlook, tugs(ends), few)).mean(axis=1)
-        rate = np.where(self._reached(estimator, ends), gain / np.maximum(ahead, 1), 0.0)
+        reached = self._reached(estimator, ends)
+
+        def rates(which: Int[np.ndarray, " k"], s: Float[Array, "_few n"]) -> Float[np.ndarray, " k"]:
+            gain = self._allowed_gain(outcomes(outlook, tugs(ends[which]), s)).mean(axis=1)
+            return np.where(reached[which], gain / np.maximum(ahead[which], 1), 0.0)
+
+        first = rates(np.arange(len(ends)), few[:1])
+        likely = np.argsort(-first)[:LIKELY]
+        rate = np.zeros(len(ends))
+        rate[likely] = (first[likely] + (EXPECTED - 1) * rates(likely, few[1:])) / EXPECTED
         best = [i for i in np.argsort(-rate)[:TRIED] if rate[i] > 0]
         for share, i in product(SHORTER, best):
             tip = tool.position + share * STEP * min(ahead[i], 1) * DIRECTIONS[i // len(AHEAD)]
@@ -197,7 +207,7 @@ class Information(Policy):
             self._edge = SheetMesh(rest, estimator.sheet.faces).border
             places = _spread(rest, PLACES)
             self._worth = dict.fromkeys(places[self._reached(estimator, rest[places])].tolist(), np.inf)
-        probability = np.asarray(outlook.belief.mixture().attached)
+        probability = np.asarray(outlook.mixture.attached)
         few, many = self._drawn(outlook)
         here = None if estimator.hold is None else estimator.hold.tip
         fresh: set[int] = set()

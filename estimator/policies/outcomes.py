@@ -7,12 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 from jiggle_mj.estimator.outlook import Outcome, Outlook, Tug
+
+BATCH = 32
+"""Pairs of pull and scenario that GPUs look at together: one compilation serves any number of either."""
 
 
 def outcomes(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
-    """Of each tug in each scenario: at once on GPUs, in turn on a CPU, where one compilation serves any number."""
+    """Of each tug in each scenario: many at once on GPUs, in turn on a CPU."""
     if jax.default_backend() != "cpu":
         return at_once(outlook, tugs, s, informative=informative)
     each_tug = [jax.tree.map(lambda leaf, i=i: leaf[i], tugs) for i in range(len(tugs.to))]
@@ -21,28 +24,33 @@ def outcomes(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, inf
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked)
 
 
+def at_once(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
+    """The same in batches, the pairs of each dealt out to all devices, each of which iterates for itself."""
+    shape = len(tugs.to), len(s)
+    pairs = np.resize(np.arange(math.prod(shape)), (-(-math.prod(shape) // BATCH), BATCH))
+    found = []
+    for batch in pairs:
+        pulls = jax.tree.map(lambda leaf, batch=batch: leaf[batch // len(s)], tugs)
+        found.append(_dealt(outlook, pulls, s[batch % len(s)], informative=informative))
+    whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: math.prod(shape)], *found)
+    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
+
+
+@eqx.filter_jit
+def _dealt(outlook: Outlook, pulls: Tug, s: Float[Array, "batch n"], *, informative: bool) -> Outcome:
+    """Of each pull in its own scenario."""
+    known, rest = eqx.partition(outlook, eqx.is_array)
+    devices = jax.devices()[: math.gcd(BATCH, len(jax.devices()))]
+
+    def some(known: Outlook, pulls: Tug, s: Float[Array, "some n"]) -> Outcome:
+        whole = eqx.combine(known, rest)
+        return jax.vmap(lambda pull, one: _outcome(whole, pull, one, informative=informative))(pulls, s)
+
+    mesh, dealt, everywhere = Mesh(np.array(devices), ("pairs",)), PartitionSpec("pairs"), PartitionSpec()
+    shared = jax.shard_map(some, mesh=mesh, in_specs=(everywhere, dealt, dealt), out_specs=dealt, check_vma=False)
+    return shared(known, pulls, s)
+
+
 @eqx.filter_jit
 def _outcome(outlook: Outlook, tug: Tug, s: Float[Array, " n"], *, informative: bool) -> Outcome:
     return outlook.outcome(tug, jnp.where(tug.loaded, 0.0, s), informative=informative)
-
-
-@eqx.filter_jit
-def at_once(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, informative: bool = True) -> Outcome:
-    """The same, the pairs of tug and scenario dealt out to all devices, each of which iterates for itself."""
-    shape, devices = (len(tugs.to), len(s)), jax.devices()
-    pairs = jnp.arange(-(-math.prod(shape) // len(devices)) * len(devices)) % math.prod(shape)
-    known, rest = eqx.partition((outlook, tugs, s), eqx.is_array)
-
-    def some(known: tuple, pairs: Int[Array, " some"]) -> Outcome:
-        outlook, tugs, s = eqx.combine(known, rest)
-
-        def one(pair: Int[Array, ""]) -> Outcome:
-            tug = jax.tree.map(lambda leaf: leaf[pair // len(s)], tugs)
-            return _outcome(outlook, tug, s[pair % len(s)], informative=informative)
-
-        return jax.vmap(one)(pairs)
-
-    dealt, everywhere = PartitionSpec("pairs"), PartitionSpec()
-    mesh = Mesh(np.array(devices), ("pairs",))
-    found = jax.shard_map(some, mesh=mesh, in_specs=(everywhere, dealt), out_specs=dealt, check_vma=False)(known, pairs)
-    return jax.tree.map(lambda leaf: leaf[: math.prod(shape)].reshape(*shape, *leaf.shape[1:]), found)
