@@ -34,9 +34,9 @@ class EstimatorConfig:
     """How well held particles follow the tip [m]."""
     grip_stiffness: float = 3.0
     """Of the springs that carry held particles with the tip while the state is searched [k]."""
-    judge_each_grasp: bool = True
-    """Whether the implicit filter judges noise and belief thoroughly whenever the jaws open, or only at the end, which
-    saves a policy's user seconds to minutes of waiting: in passing a few samples do."""
+    acting: bool = False
+    """Whether a policy waits for the belief: after each frame a few samples say where the implicit filter's belief is,
+    a second or two instead of a sweep's milliseconds, and noise and belief are judged thoroughly at the end alone."""
     detect_above: float = 0.011
     """Filters that state no probability report a particle attached when its mean stiffness exceeds this [k]."""
 

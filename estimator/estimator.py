@@ -277,12 +277,12 @@ class Estimator:
             self._change(event, observation.index)
         assert self._filter is not None
         if not tool.closed:
-            self._release(thorough=self.config.judge_each_grasp)
+            self._release(thorough=not self.config.acting)
             self._hold = self._closing = None
             self._idle = observation
             return None
         if self._closing is None or self._closing.grasp != tool.grasp:
-            self._release(thorough=self.config.judge_each_grasp)
+            self._release(thorough=not self.config.acting)
             self._closing = tool
         began = time.perf_counter()
         track = self._see(observation)
@@ -298,7 +298,8 @@ class Estimator:
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
             )
         self._hold, self._x = hold, np.asarray(update.x)
-        self._believe(update)
+        stated = (self._filter.reconsider(update.belief) if self.config.acting else None) or update
+        self._believe(stated)
         return Estimate(
             index=observation.index,
             time=observation.time,
@@ -308,7 +309,7 @@ class Estimator:
             sd=self._sd,
             probability=self._probability,
             held=hold.held,
-            entropy=float(update.entropy),
+            entropy=float(stated.entropy),
             nis=float(update.nis),
             boundary_energy=0.5 * float(np.mean(self._b * np.sum((self._x - self.sheet.rest) ** 2, axis=1))),
             update_s=time.perf_counter() - seen,
@@ -322,7 +323,7 @@ class Estimator:
         if not region.any():
             self.skipped.append((index, f"the {type(event).__name__.lower()} is beside the sheet, and was left out"))
             return
-        self._release(thorough=self.config.judge_each_grasp)
+        self._release(thorough=not self.config.acting)
         assert self._filter is not None
         if isinstance(self._belief, AttachmentBelief) and isinstance(self._filter, ImplicitFilter):
             if self.changes:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jiggle_mj.estimator.outlook import Outlook, Tug, expected_fall
+from jiggle_mj.estimator.policies.information import underrated
 from jiggle_mj.estimator.policies.outcomes import at_once, outcomes
 from jiggle_mj.estimator.spike_and_slab import Mixture
 from small_sheet import GRIP_RADIUS, NOISE, attached, corners, sheet, sheet_balance, sheet_prior
@@ -95,6 +96,18 @@ def test_a_pull_at_what_is_attached_loads_it_more_the_higher_it_goes(outlook):
     assert high.energy == pytest.approx(0.5 * b * (away**2).sum() / sheet().n)
     assert high.force == pytest.approx(b * away.max())
     assert high.energy > low.energy and high.force > low.force and high.gain > low.gain > 0
+
+
+@pytest.mark.parametrize(("stretched", "times"), [(1.0, 1.0), (2.0, 4.0), (0.5, 1.0)])
+def test_an_energy_that_was_underrated_counts_as_often_as_it_is_seen(outlook, stretched, times):
+    """Attachments that are seen twice as far from their anchors as predicted hold four times the energy."""
+    s, rest = jnp.where(attached(), KNOWN, 0.0), jnp.asarray(sheet().rest)
+    pull = lift(12e-3)
+    predicted = eqx.filter_jit(outlook.outcome)(pull, s, informative=False).x
+    seen = eqx.tree_at(lambda one: one.start, pull, rest + stretched * (predicted - rest))
+    one = jax.tree.map(lambda leaf: leaf[None], seen)
+    assert underrated(outlook, one, s[None], least=1e-12) == pytest.approx(times, rel=1e-2)
+    assert underrated(outlook, one, s[None], least=1.0) == 1.0
 
 
 def test_free_tissue_bears_nothing(outlook):

@@ -95,6 +95,10 @@ class Filter(ABC):
     def forget(self) -> None:  # noqa: B027  # most keep nothing
         """Something was cut or sewn: take nothing again that was seen before."""
 
+    def reconsider(self, belief: Any) -> Stated | None:
+        """A second look at a belief between two frames, for whoever acts on it; None where there is none."""
+        return None
+
     def release(self, belief: Any, *, thorough: bool = True) -> Stated | None:
         """Say that the jaws have opened; None where that changes nothing. In passing if more grasps are to come."""
         return None

@@ -77,6 +77,10 @@ class ImplicitFilter(Filter):
             self._between = False
         return update
 
+    def reconsider(self, belief: AttachmentBelief) -> Stated:
+        """See `Filter.reconsider`: as few samples give it, which find most of what propagation misses in a grasp."""
+        return _sampled(belief, PASSING)
+
     def release(self, belief: AttachmentBelief, *, thorough: bool = True) -> Stated | None:
         """The belief with all grasps linearised again that need it; the next frame begins another grasp.
 

@@ -7,8 +7,10 @@ steps.
 
 Safe is a step after which, in the scenarios of the belief, neither the mean boundary energy nor the force on any
 attachment passes its limit, less a margin, with more than the allowed chance: their square root and it are taken as
-normal over the scenarios. Particles in the jaws and their neighbours, on which no force can be seen, are taken to be
-free: inside the sheet no place is grasped that is not known to be, and the first is on its edge.
+normal over the scenarios. What the energy was predicted to be where the tip is now is held against what the scenarios
+make of where the particles are seen: by as much as it was too low, pulls from here are reckoned with more. Particles
+in the jaws and their neighbours, on which no force can be seen, are taken to be free: inside the sheet no place is
+grasped that is not known to be, and the first is on its edge.
 """
 
 from itertools import product
@@ -57,6 +59,8 @@ DECIDED = 0.05
 """P(attached) or P(free) of a particle about which enough is known."""
 KNOWN, SUSPECTED = 0.02, 0.2
 """P(attached) up to which a place may be grasped, inside the sheet and on its edge."""
+TRIFLE = 0.1
+"""Share of the limit on the energy below which a prediction is not held against what is seen."""
 LOST = 5e-3
 """Slip from which the tissue is no longer in the jaws [m]."""
 _SLANT = 0.5**0.5
@@ -182,11 +186,13 @@ class Information(Policy):
         def tugs(tips: Float[np.ndarray, "k 3"]) -> Tug:
             return self._tugs(estimator, hold.held, start, hold.closed_at + (tips - hold.tip)[:, None])
 
+        more = underrated(outlook, tugs(tool.position[None]), many, least=TRIFLE * self._limits.energy)
+
         ends, ahead = tool.position + PULLS, np.tile(AHEAD, len(DIRECTIONS))
         reached = self._reached(estimator, ends)
 
         def rates(which: Int[np.ndarray, " k"], s: Float[Array, "_few n"]) -> Float[np.ndarray, " k"]:
-            gain = self._allowed_gain(outcomes(outlook, tugs(ends[which]), s)).mean(axis=1)
+            gain = self._allowed_gain(outcomes(outlook, tugs(ends[which]), s), more=more).mean(axis=1)
             return np.where(reached[which], gain / np.maximum(ahead[which], 1), 0.0)
 
         first = rates(np.arange(len(ends)), few[:1])
@@ -196,7 +202,7 @@ class Information(Policy):
         best = [i for i in np.argsort(-rate)[:TRIED] if rate[i] > 0]
         for share, i in product(SHORTER, best):
             tip = tool.position + share * STEP * min(ahead[i], 1) * DIRECTIONS[i // len(AHEAD)]
-            if self._safe(outlook, tugs(tip[None]), many):
+            if self._safe(outlook, tugs(tip[None]), many, more=more):
                 return tip, float(rate[i])
         return None
 
@@ -258,15 +264,15 @@ class Information(Policy):
         start, held, loaded = (np.broadcast_to(part, (len(to), *part.shape)) for part in parts)
         return Tug(start=jnp.asarray(start), held=jnp.asarray(held), loaded=jnp.asarray(loaded), to=jnp.asarray(to))
 
-    def _allowed_gain(self, found: Outcome) -> Float[np.ndarray, "k scenarios"]:
-        """Gains, 0 where a limit would be passed or nothing finite is predicted."""
-        allowed = (found.energy <= self._energy) & (found.force <= self._force)
+    def _allowed_gain(self, found: Outcome, *, more: float = 1.0) -> Float[np.ndarray, "k scenarios"]:
+        """Gains, 0 where a limit would be passed or nothing finite is predicted; energies count `more` times."""
+        allowed = (more * found.energy <= self._energy) & (found.force <= self._force)
         return np.where(allowed, np.nan_to_num(found.gain), 0.0)
 
-    def _safe(self, outlook: Outlook, tug: Tug, many: Float[Array, "_many n"]) -> bool:
+    def _safe(self, outlook: Outlook, tug: Tug, many: Float[Array, "_many n"], *, more: float = 1.0) -> bool:
         """Whether the chance to pass a limit is small enough, by what one tug does in all scenarios."""
         found, far = outcomes(outlook, tug, many, informative=False), NormalDist().inv_cdf(1 - self._limits.chance)
-        for values, limit in ((jnp.sqrt(found.energy), self._energy**0.5), (found.force, self._force)):
+        for values, limit in ((jnp.sqrt(more * found.energy), self._energy**0.5), (found.force, self._force)):
             if not float(jnp.mean(values) + far * jnp.std(values)) <= limit:
                 return False
         return True
@@ -275,6 +281,22 @@ class Information(Policy):
         self._key, one, other = jax.random.split(self._key, 3)
         unknown = jnp.asarray(self._limits.unknown)
         return _scenarios(outlook, one, EXPECTED, unknown), _scenarios(outlook, other, JUDGED, unknown)
+
+
+def underrated(outlook: Outlook, tug: Tug, s: Float[Array, "scenarios n"], *, least: float) -> float:
+    """How many times the predicted energy what is seen amounts to, over scenarios in the median; at least 1.
+
+    Args:
+        outlook: what is predicted from.
+        tug: to where the tip is, from where the particles are seen.
+        s: the scenarios.
+        least: less than this is not predicted [J].
+    """
+    squared = jnp.sum((tug.start[0] - outlook.balance.energy.rest) ** 2, axis=1)
+    b = outlook.balance.reference * s / (1 - s)
+    seen = 0.5 * jnp.median(b @ squared) / len(squared)
+    predicted = jnp.median(outcomes(outlook, tug, s, informative=False).energy)
+    return max(1.0, float(seen / jnp.maximum(predicted, least)))
 
 
 @eqx.filter_jit
