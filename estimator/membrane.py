@@ -1,4 +1,4 @@
-"""In-plane elasticity of the sheet: St Venant-Kirchhoff triangles, or springs along the edges as in the paper.
+"""In-plane elasticity of the sheet: triangles, St Venant-Kirchhoff as built, or springs along the edges as the paper's.
 
 Both are `Term`s of the energy and take one membrane stiffness k = Young's modulus x thickness [N/m]. Neither knows
 bending. Small strains, large rotations.
@@ -12,77 +12,98 @@ from jiggle_mj.estimator.mesh import SheetMesh
 
 
 class TriangleMembrane(Term):
-    """Constant-strain St Venant-Kirchhoff triangles in plane stress.
+    """Constant-strain triangles in plane stress, St Venant-Kirchhoff as built.
 
-    With F the deformation gradient, E = (F^T F - I) / 2 and S = k / (1 - nu^2) ((1 - nu) E + nu tr(E) I), a triangle of
-    rest area A stores A/2 S:E.
+    With F the deformation gradient, E = (F^T F - I) / 2 - E_0 as (E_11, E_22, 2 E_12), and w = E.C E / k, a triangle of
+    rest area A stores A k / 2 (w + a w^2 / 2): C is the elasticity, E_0 a strain that asks for no stress, a the
+    stiffening. Axis 1 lies in the triangle and follows a world axis, the same for all of them.
     """
 
     vertices: Int[np.ndarray, "f 3"] | Int[Array, "f 3"]
     shape_gradient: Float[Array, "f 3 2"]
-    """Derivative of each corner's shape function along two material axes [1/m]."""
+    """Derivative of each corner's shape function along the two material axes [1/m]."""
     area: Float[Array, " f"]
     """Rest area [m^2]."""
     stiffness: Float[Array, ""]
     """k [N/m]."""
-    poisson: Float[Array, ""]
+    elasticity: Float[Array, "f 3 3"]
+    """C [N/m]."""
+    inelastic: Float[Array, "f 3"]
+    """E_0."""
+    stiffening: Float[Array, ""]
+    """a."""
 
     @classmethod
     def build(cls, mesh: SheetMesh, *, stiffness: float, poisson: float) -> "TriangleMembrane":
-        """Triangles of the mesh at rest."""
+        """Isotropic triangles of the mesh at rest: C E = k / (1 - nu^2) ((1 - nu) E + nu tr(E) I)."""
         a, b, c = np.moveaxis(mesh.rest[mesh.faces], 1, 0)
-        first = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
         normal = np.cross(b - a, c - a)
-        second = np.cross(normal / np.linalg.norm(normal, axis=1, keepdims=True), first)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        axis = material_axis(normal.mean(axis=0))
+        first = axis - (normal @ axis)[:, None] * normal
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        second = np.cross(normal, first)
         material = np.stack([b - a, c - a], axis=-1)
         flat = np.stack([first, second], axis=1) @ material
         inverse = np.linalg.inv(flat)
         gradient = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+        plane = np.array([[1, poisson, 0], [poisson, 1, 0], [0, 0, (1 - poisson) / 2]]) / (1 - poisson**2)
+        m = len(mesh.faces)
         return cls(
             vertices=mesh.faces,
             shape_gradient=jnp.asarray(gradient),
             area=jnp.asarray(mesh.face_area),
             stiffness=jnp.asarray(stiffness, dtype=float),
-            poisson=jnp.asarray(poisson, dtype=float),
+            elasticity=jnp.asarray(np.broadcast_to(stiffness * plane, (m, 3, 3))),
+            inelastic=jnp.zeros((m, 3)),
+            stiffening=jnp.zeros(()),
         )
 
-    def _stress(self, strain: Float[Array, "f 2 2"]) -> Float[Array, "f 2 2"]:
-        trace = jnp.trace(strain, axis1=1, axis2=2)[:, None, None] * jnp.eye(2, dtype=strain.dtype)[None]
-        return self.stiffness / (1 - self.poisson**2) * ((1 - self.poisson) * strain + self.poisson * trace)
-
-    def _deformation(self, x: Float[Array, "f 3 3"]) -> tuple[Float[Array, "f 3 2"], Float[Array, "f 2 2"]]:
-        F = jnp.einsum("fai,fak->fik", x, self.shape_gradient)
-        return F, 0.5 * (F.swapaxes(1, 2) @ F - jnp.eye(2, dtype=x.dtype)[None])
+    def strain(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3"]:
+        """Green's, whether elastic or not: (E_11, E_22, 2 E_12)."""
+        return _green(self._deformation(x))
 
     def energy(self, x: Float[Array, "f 3 3"]) -> Float[Array, " f"]:
-        """A/2 S:E [J]."""
-        _, strain = self._deformation(x)
-        return 0.5 * self.area * jnp.sum(self._stress(strain) * strain, axis=(1, 2))
+        """[J]."""
+        strain = self.strain(x) - self.inelastic
+        w = jnp.einsum("fp,fpq,fq->f", strain, self.elasticity, strain) / self.stiffness
+        return 0.5 * self.area * self.stiffness * (w + 0.5 * self.stiffening * w**2)
 
     def gradient(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3"]:
         """A F S grad N [N]."""
-        F, strain = self._deformation(x)
-        return self.area[:, None, None] * jnp.einsum("fik,fkl,fal->fai", F, self._stress(strain), self.shape_gradient)
+        F = self._deformation(x)
+        stress, _, _ = self._stress(F)
+        return self.area[:, None, None] * jnp.einsum("fik,fkl,fal->fai", F, _matrix(stress), self.shape_gradient)
 
     def hessian(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3 3 3"]:
         """Material and geometric part [N/m]."""
-        F, strain = self._deformation(x)
-        return self._tangent(F, self._stress(strain))
+        return self._tangent(x, compressive=True)
 
     def positive_hessian(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3 3 3"]:
         """The same with compressive principal stresses left out, which makes the geometric part semi-definite."""
-        F, strain = self._deformation(x)
-        return self._tangent(F, _tensile(self._stress(strain)))
+        return self._tangent(x, compressive=False)
 
-    def _tangent(self, F: Float[Array, "f 3 2"], stress: Float[Array, "f 2 2"]) -> Float[Array, "f 3 3 3 3"]:
-        N, nu = self.shape_gradient, self.poisson
-        variation = jnp.einsum("fik,fal->faikl", F, N)
-        variation = 0.5 * (variation + variation.swapaxes(3, 4))
-        trace = jnp.trace(variation, axis1=3, axis2=4)
-        material = (1 - nu) * jnp.einsum("faikl,fbjkl->faibj", variation, variation)
-        material = material + nu * jnp.einsum("fai,fbj->faibj", trace, trace)
+    def _deformation(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 2"]:
+        return jnp.einsum("fai,fak->fik", x, self.shape_gradient)
+
+    def _stress(self, F: Float[Array, "f 3 2"]) -> tuple[Float[Array, "f 3"], Float[Array, "f 3"], Float[Array, " f"]]:
+        """S = (1 + a w) C E, C E, and 1 + a w [N/m]."""
+        strain = _green(F) - self.inelastic
+        linear = jnp.einsum("fpq,fq->fp", self.elasticity, strain)
+        stiffer = 1 + self.stiffening * jnp.sum(strain * linear, axis=1) / self.stiffness
+        return stiffer[:, None] * linear, linear, stiffer
+
+    def _tangent(self, x: Float[Array, "f 3 3"], *, compressive: bool) -> Float[Array, "f 3 3 3 3"]:
+        F, N = self._deformation(x), self.shape_gradient
+        stress, linear, stiffer = self._stress(F)
+        tangent = stiffer[:, None, None] * self.elasticity
+        tangent = tangent + 2 * self.stiffening / self.stiffness * linear[:, :, None] * linear[:, None, :]
+        shear = jnp.einsum("fi,fa->fai", F[:, :, 0], N[:, :, 1]) + jnp.einsum("fi,fa->fai", F[:, :, 1], N[:, :, 0])
+        variation = jnp.stack([*(jnp.einsum("fi,fa->fai", F[:, :, k], N[:, :, k]) for k in (0, 1)), shear], axis=-1)
+        material = jnp.einsum("faip,fpq,fbjq->faibj", variation, tangent, variation)
+        stress = _matrix(stress) if compressive else _tensile(_matrix(stress))
         geometric = jnp.einsum("fak,fkl,fbl,ij->faibj", N, stress, N, jnp.eye(3, dtype=F.dtype))
-        return self.area[:, None, None, None, None] * (self.stiffness / (1 - nu**2) * material + geometric)
+        return self.area[:, None, None, None, None] * (material + geometric)
 
 
 class EdgeMembrane(Term):
@@ -130,6 +151,20 @@ class EdgeMembrane(Term):
         window = along + across[:, None, None] * (jnp.eye(3, dtype=x.dtype)[None] - along)
         sign = jnp.array([[1.0, -1.0], [-1.0, 1.0]], dtype=x.dtype)
         return jnp.einsum("e,ab,eij->eaibj", self.stiffness, sign, window)
+
+
+def material_axis(normal: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """The world axis that material axis 1 follows: x, unless the sheet's normal lies nearer to it than to y or z."""
+    return np.eye(3)[0 if abs(normal[0]) <= max(abs(normal[1]), abs(normal[2])) else 1]
+
+
+def _green(F: Float[Array, "f 3 2"]) -> Float[Array, "f 3"]:
+    metric = jnp.einsum("fik,fil->fkl", F, F)
+    return jnp.stack([0.5 * (metric[:, 0, 0] - 1), 0.5 * (metric[:, 1, 1] - 1), metric[:, 0, 1]], axis=1)
+
+
+def _matrix(stress: Float[Array, "f 3"]) -> Float[Array, "f 2 2"]:
+    return stress[:, jnp.array([[0, 2], [2, 1]])]
 
 
 def _tensile(stress: Float[Array, "f 2 2"]) -> Float[Array, "f 2 2"]:

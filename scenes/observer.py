@@ -72,6 +72,12 @@ class Observer:
             "stereo": lambda: None,
             "cloud": lambda: None,
         }[sensing]()
+        settings = scene.sensing
+        self._smooth = (
+            sense.smooth_factor(sheet, sd=settings.smooth_sd, length=settings.smooth_length)
+            if settings.smooth_sd and sensing != "stereo"
+            else None
+        )
         self.camera = stereo_camera(scene.camera)
         """As it is believed to be."""
         self._renderer = None
@@ -175,7 +181,17 @@ class Observer:
         if self._slid.any():
             tracks = sense.slid(tracks, sheet, self._slid)
         positions = self._misplaced(tracks.positions(self.simulation.surface(data)))
-        return sense.measure(positions, sd=settings.point_sd, rng=self._rng, tracked=not cloud)
+        smooth = None
+        if self._smooth is not None:
+            smooth = tracks.positions(self._smooth @ self._rng.standard_normal((len(self._smooth), 3)))
+        return sense.measure(
+            positions,
+            sd=settings.point_sd,
+            rng=self._rng,
+            tracked=not cloud,
+            smooth=smooth,
+            smooth_sd=settings.smooth_sd,
+        )
 
     def _misplaced(self, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
         """Where the wrongly placed pair finds points [m]."""

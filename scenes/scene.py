@@ -179,7 +179,11 @@ class Sensing(Section):
 
     section: ClassVar[str] = "sensing"
     point_sd: float = number(2e-4, unit="m", above=0, at_most=0.1)
-    """Standard deviation of each coordinate of a measured point [m]."""
+    """Standard deviation of each coordinate of a measured point, on its own [m]."""
+    smooth_sd: float = number(0.0, unit="m", at_least=0, at_most=0.1)
+    """Standard deviation of noise on top of that, which points near to one another share, as a tracker's do [m]."""
+    smooth_length: float = number(0.01, unit="m", above=0, at_most=1)
+    """Distance over the sheet at which that noise correlates by exp(-1/2) [m]."""
     n_points: int = integer(600, at_least=10, at_most=100000)
     """Tracked material points of `sensing = points`."""
     cloud_points: int = integer(3000, at_least=10, at_most=100000)

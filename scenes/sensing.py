@@ -81,11 +81,27 @@ def barycentric(sheet: Triangulation, places: Float[np.ndarray, "m 2"]) -> Float
 
 
 def measure(
-    positions: Float[np.ndarray, "m 3"], *, sd: float, rng: np.random.Generator, tracked: bool
+    positions: Float[np.ndarray, "m 3"],
+    *,
+    sd: float,
+    rng: np.random.Generator,
+    tracked: bool,
+    smooth: Float[np.ndarray, "m 3"] | None = None,
+    smooth_sd: float = 0.0,
 ) -> MeasuredPoints:
-    """Add white noise of standard deviation `sd` [m] to each coordinate."""
+    """Add white noise of standard deviation `sd` [m] to each coordinate, and the smooth noise that is given."""
     noisy = positions + sd * rng.standard_normal(positions.shape)
-    return MeasuredPoints(positions=noisy, track_id=np.arange(len(positions)) if tracked else None, sd=sd)
+    noisy = noisy if smooth is None else noisy + smooth
+    stated = float(np.hypot(sd, smooth_sd))
+    return MeasuredPoints(positions=noisy, track_id=np.arange(len(positions)) if tracked else None, sd=stated)
+
+
+def smooth_factor(sheet: Triangulation, *, sd: float, length: float) -> Float[np.ndarray, "n n"]:
+    """L of the noise L z at the vertices [m] with z white: covariance sd^2 exp(-d^2 / 2 length^2), d over the sheet."""
+    squared = np.sum((sheet.vertices[:, None] - sheet.vertices[None]) ** 2, axis=2)
+    kernel = np.exp(-0.5 * squared / length**2)
+    values, vectors = np.linalg.eigh(kernel)
+    return sd * vectors * np.sqrt(np.maximum(values, 0))
 
 
 def add_image_noise(pair: StereoPair, *, sd: float, rng: np.random.Generator) -> StereoPair:

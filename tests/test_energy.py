@@ -34,8 +34,18 @@ def terms() -> dict[str, Term]:
         to=jnp.asarray(MESH.rest + 1e-3),
         stiffness=jnp.asarray(root @ root.swapaxes(1, 2)),
     )
+    plain = TriangleMembrane.build(MESH, stiffness=K, poisson=NU)
+    fibres = jnp.asarray(np.outer([0.6, 0.3, 0.4], [0.6, 0.3, 0.4]))
+    tissue = dataclasses.replace(
+        plain,
+        elasticity=plain.elasticity * jnp.asarray(generator.uniform(0.5, 2, (len(MESH.faces), 1, 1)))
+        + 2 * K * fibres[None],
+        inelastic=jnp.asarray(generator.normal(size=(len(MESH.faces), 3)) * 0.005),
+        stiffening=jnp.asarray(5.0),
+    )
     return {
         "triangles": TriangleMembrane.build(MESH, stiffness=K, poisson=NU),
+        "fibres that stiffen and are stretched at rest": tissue,
         "edges": EdgeMembrane.build(MESH, stiffness=K),
         "bending": IsometricBending.build(MESH, stiffness=PLATE),
         "bending of a rough sheet": IsometricBending.build(ROUGH, stiffness=PLATE),
@@ -174,6 +184,15 @@ def test_a_triangle_membrane_in_uniaxial_tension_has_the_typed_modulus_and_poiss
     # The energy is quadratic in E, so symmetric about its minimum.
     assert density(strain, -NU * strain + 0.01) == pytest.approx(density(strain, -NU * strain - 0.01), rel=1e-10)
     assert density(strain, -NU * strain + 0.01) > density(strain, -NU * strain)
+
+
+def test_axis_1_of_a_membrane_is_the_worlds_x_where_the_sheet_is_not_edge_on_to_it():
+    """A stretch along x is E_11 in a level sheet; in one across x, the stretch along y is."""
+    for turn, stretch in (("z", [1.2, 1, 1]), ("y", [1, 1.2, 1])):
+        mesh = dataclasses.replace(MESH, rest=Rotation.from_euler(turn, 90, degrees=True).apply(MESH.rest))
+        term = TriangleMembrane.build(mesh, stiffness=K, poisson=NU)
+        strain = term.strain(jnp.asarray(mesh.rest * stretch)[term.vertices])
+        np.testing.assert_allclose(strain, np.tile([0.5 * (1.2**2 - 1), 0, 0], (len(mesh.faces), 1)), atol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 1.2])

@@ -288,3 +288,20 @@ def test_a_secret_is_in_the_truth_alone(tmp_path, monkeypatch, capsys):
 def test_the_shipped_scenes_are_undisturbed():
     assert load_scene("arc").disturbances == () and not load_scene("arc").secret
     assert math.isclose(sum(one.start for one in disturbed(SCENE, ["gravity", "blur"]).disturbances), 0)
+
+
+def test_smooth_noise_is_shared_by_neighbours_and_new_in_each_frame():
+    """Over many frames the covariance of two points is smooth_sd^2 exp(-d^2 / 2 smooth_length^2)."""
+    sd, length, frames = 3e-4, 0.01, 300
+    noisy = dataclasses.replace(SCENE, sensing=Sensing(point_sd=EXACT, smooth_sd=sd, smooth_length=length))
+    reference = Reference(noisy, seed=0, sensing="particles")
+    observer = reference._observer
+    views = [observer.look() for _ in range(frames)]
+    seen = np.array([view[1].positions for view in views if view is not None and view[1] is not None])
+    assert views[0][1].sd == pytest.approx(math.hypot(EXACT, sd))
+    off = seen - seen.mean(axis=0)
+    found = np.einsum("tmi,tni->mn", off, off) / (3 * frames)
+    apart = np.linalg.norm(seen[0][:, None, :2] - seen[0][None, :, :2], axis=2)
+    np.testing.assert_allclose(found, sd**2 * np.exp(-0.5 * apart**2 / length**2), atol=0.15 * sd**2)
+    again = np.einsum("tmi,tmi->", off[1:], off[:-1]) / np.einsum("tmi,tmi->", off, off)
+    assert abs(again) < 0.1
