@@ -13,16 +13,23 @@ class Weight(Term):
     """-m g . x."""
 
     vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
-    force: Float[Array, "n 3"]
-    """Mass times gravity [N]."""
+    mass: Float[Array, " n"]
+    """[kg]."""
+    gravity: Float[Array, " 3"]
+    """[m/s^2]."""
 
     @classmethod
     def build(
         cls, particle_area: Float[np.ndarray, " n"], *, areal_density: float, gravity: tuple[float, float, float]
     ) -> "Weight":
         """Weight of each particle's share of the sheet."""
-        force = areal_density * particle_area[:, None] * np.asarray(gravity)
-        return cls(vertices=np.arange(len(force))[:, None], force=jnp.asarray(force))
+        mass, g = areal_density * particle_area, np.asarray(gravity, dtype=float)
+        return cls(vertices=np.arange(len(mass))[:, None], mass=jnp.asarray(mass), gravity=jnp.asarray(g))
+
+    @property
+    def force(self) -> Float[Array, "n 3"]:
+        """Mass times gravity [N]."""
+        return self.mass[:, None] * self.gravity[None]
 
     def energy(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
         """[J]."""

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.blas import one_thread
@@ -127,6 +127,11 @@ class Estimator:
     def hold(self) -> GripHold | None:
         """What the jaws hold; None while they are open."""
         return self._hold
+
+    @property
+    def track_ids(self) -> Int[np.ndarray, " n"] | None:
+        """Which tracked point each particle is; None where they have no names."""
+        return self._points.ids if len(self._points.ids) else None
 
     @property
     def slip(self) -> float:

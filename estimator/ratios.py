@@ -26,7 +26,7 @@ def scaled(energy: SheetEnergy, log_factor: Float[Array, " k"]) -> SheetEnergy:
 
     def one(term: Term) -> Term:
         if isinstance(term, Weight):
-            return eqx.tree_at(lambda t: t.force, term, factor["weight"] * term.force)
+            return eqx.tree_at(lambda t: t.mass, term, factor["weight"] * term.mass)
         if isinstance(term, Bed):
             rest = energy.rest @ term.up
             return eqx.tree_at(lambda t: t.height, term, rest + factor["weight"] * (term.height - rest))

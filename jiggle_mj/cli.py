@@ -312,6 +312,50 @@ def identify(recording: PathArgument, /, *, allow_truncated: bool = False, as_js
         print(json.dumps({"ratios": ratios, "refused": material.refused, "declaration": declared}))
 
 
+def close_loop(
+    recording: PathArgument,
+    /,
+    *,
+    out: Out,
+    truth: Path | None = None,
+    allow_truncated: bool = False,
+    overwrite: bool = False,
+    as_json: AsJson = False,
+) -> None:
+    """What the model lacks of a recording: the residual, the effect behind it, and the error before and after.
+
+    Args:
+        recording: an MCAP file.
+        out: folder for discrepancy.json and discrepancy.html.
+        truth: a truth file, to score what is found attached before and after; opened when all is decided.
+        allow_truncated: use what is whole of a recording that was cut off.
+        overwrite: replace results that are already in the folder.
+        as_json: print discrepancy.json to stdout.
+    """
+    from jiggle_mj.eval.closing_the_loop import PAGE
+    from jiggle_mj.eval.closing_the_loop import close_loop as close
+    from jiggle_mj.eval.discrepancy_page import story
+    from jiggle_mj.recording import Recording
+
+    length = len(Recording.open(recording, allow_truncated=allow_truncated))
+    with _progress(length, f"follow {recording.name}") as on_frame:
+        found = close(
+            recording,
+            out,
+            truth=truth,
+            allow_truncated=allow_truncated,
+            overwrite=overwrite,
+            on_frame=on_frame,
+            say=lambda text: console.print(text, highlight=False, markup=False),
+        )
+    console.print(found["verdict"], style="bold")
+    for sentence in story(found):
+        console.print(sentence, highlight=False, markup=False)
+    console.print(f"report: {out / PAGE}")
+    if as_json:
+        print(json.dumps(found))
+
+
 def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = None, as_json: AsJson = False) -> None:
     """Score an estimate against a truth file, and write the truth into its report.
 
@@ -486,6 +530,7 @@ VERBS = {
     "import": import_,
     "estimate": estimate,
     "identify": identify,
+    "close-loop": close_loop,
     "score": score,
     "table": table,
     "bench": bench,

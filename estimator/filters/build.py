@@ -3,6 +3,7 @@
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.config import EstimatorConfig
+from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.filters.adam import AdamShooting
 from jiggle_mj.estimator.filters.evidence import Filter
 from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
@@ -25,26 +26,33 @@ def build_filter(
 ) -> tuple[Filter, BoundaryBelief | AttachmentBelief]:
     """A filter and its prior; shares in the settings become stiffnesses of the declared membrane."""
     k = declaration.membrane_stiffness
-    grip_stiffness, force_sd = config.grip_stiffness * k, config.force_sd * k * mesh.spacing
+    energy = surrogate(mesh, declaration, membrane=config.membrane)
     if config.filter == "implicit":
-        reference = config.reference * k
-        balance = ForceBalance.build(
-            mesh,
-            surrogate(mesh, declaration, membrane=config.membrane),
-            reference=reference,
-            force_sd=force_sd,
-            force_level=FORCE_LEVEL * k * mesh.spacing,
-            anchor_sd=config.anchor_sd,
-            grip_stiffness=grip_stiffness,
-        )
-        return ImplicitFilter(balance), prior_belief(mesh, reference=reference)
+        balance = force_balance(mesh, energy, declaration, config)
+        return ImplicitFilter(balance), prior_belief(mesh, reference=float(balance.reference))
     mean = PRIOR_MEAN if config.filter == "explicit" else 0.0
     gaussian = BoundaryBelief.prior(mesh.n, mean=mean, sd=config.prior_sd * k)
     if config.filter in ("explicit", "adam"):
         shooting = MultipleShooting if config.filter == "explicit" else AdamShooting
-        return shooting(mesh, declaration, grip_stiffness=grip_stiffness, samples=config.samples), gaussian
-    energy = surrogate(mesh, declaration, membrane=config.membrane)
+        return shooting(mesh, declaration, grip_stiffness=config.grip_stiffness * k, samples=config.samples), gaussian
+    grip_stiffness, force_sd = config.grip_stiffness * k, config.force_sd * k * mesh.spacing
     if config.filter == "nnls":
         return NonNegativeLeastSquares.build(energy, force_sd=force_sd), gaussian
     tolerance = force_sd / 4
     return ReducedUnscented(mesh, energy, grip_stiffness=grip_stiffness, force_tolerance=tolerance), gaussian
+
+
+def force_balance(
+    mesh: SheetMesh, energy: SheetEnergy, declaration: Declaration, config: EstimatorConfig
+) -> ForceBalance:
+    """The balance of forces of a declared sheet, with an energy for its mesh."""
+    k = declaration.membrane_stiffness
+    return ForceBalance.build(
+        mesh,
+        energy,
+        reference=config.reference * k,
+        force_sd=config.force_sd * k * mesh.spacing,
+        force_level=FORCE_LEVEL * k * mesh.spacing,
+        anchor_sd=config.anchor_sd,
+        grip_stiffness=config.grip_stiffness * k,
+    )

@@ -175,7 +175,7 @@ class ForceBalance(eqx.Module):
         return Frame(
             x=x,
             s=s,
-            unbalanced=self._unbalanced(x, s),
+            unbalanced=self.unbalanced(x, s),
             slope=self.reference * (x - self.energy.rest) - self.energy.internal_gradient(x),
             turn=self.reference * itself - internal,
             rows=rows,
@@ -188,12 +188,12 @@ class ForceBalance(eqx.Module):
 
     def fit(self, frame: "Frame") -> "Fit":
         """The state that explains a frame best, for the s of its linearisation."""
-        residual = frame.unbalanced + self._apply(frame.rows, frame.off)
+        residual = frame.unbalanced + self.apply(frame.rows, frame.off)
         pushed = self._transposed(frame.rows, frame.weight[:, None] * residual)
         off = solve(self.layout, frame.factor, pushed)
         return Fit(
             residual=residual,
-            left=residual - self._apply(frame.rows, off),
+            left=residual - self.apply(frame.rows, off),
             off=off,
             covariance=inverse_band(frame.factor),
         )
@@ -214,7 +214,7 @@ class ForceBalance(eqx.Module):
     def whitened(self, frame: "Frame", v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """N^-1 v."""
         pushed = self._transposed(frame.rows, frame.weight[:, None] * v)
-        return frame.weight[:, None] * (v - self._apply(frame.rows, solve(self.layout, frame.factor, pushed)))
+        return frame.weight[:, None] * (v - self.apply(frame.rows, solve(self.layout, frame.factor, pushed)))
 
     def misfit(self, frame: "Frame", fit: "Fit", evidence: Evidence) -> Misfit:
         """What is left of the frame."""
@@ -246,7 +246,7 @@ class ForceBalance(eqx.Module):
         variance = ((1 - s) * error) ** 2 + (s * self.reference * self.anchor_sd) ** 2
         return jnp.where(evidence.loaded, 0.0, 1 / variance)
 
-    def _unbalanced(self, x: Float[Array, "n 3"], s: Float[Array, " n"]) -> Float[Array, "n 3"]:
+    def unbalanced(self, x: Float[Array, "n 3"], s: Float[Array, " n"]) -> Float[Array, "n 3"]:
         """R [N]."""
         internal, d = self.energy.internal_gradient(x), x - self.energy.rest
         return (1 - s)[:, None] * internal + (s * self.reference)[:, None] * d
@@ -259,7 +259,7 @@ class ForceBalance(eqx.Module):
 
         def cost(length: Float[Array, ""]) -> Float[Array, ""]:
             x = frame.x + length * move
-            off, force = evidence.y - x, jnp.sum(self._unbalanced(x, s) ** 2, axis=1)
+            off, force = evidence.y - x, jnp.sum(self.unbalanced(x, s) ** 2, axis=1)
             return 0.5 * (jnp.einsum("ni,nij,nj->", off, evidence.precision, off) + jnp.sum(weight * force))
 
         lengths = jnp.array([0.0, 0.1, 0.25, 0.5, 1.0], move.dtype)
@@ -280,7 +280,7 @@ class ForceBalance(eqx.Module):
         parts = jnp.einsum("npij,ni->npj", rows, v)
         return jnp.zeros((len(v) + 1, 3), v.dtype).at[self.neighbours].add(parts)[:-1]
 
-    def _apply(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    def apply(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """H v."""
         padded = jnp.concatenate([v, jnp.zeros((1, 3), v.dtype)])
         return jnp.einsum("npij,npj->ni", rows, padded[self.neighbours])
@@ -289,7 +289,7 @@ class ForceBalance(eqx.Module):
         """Move of a frame's state for fixed s, with its factor; Gauss-Newton's if s is its own."""
         pull = jnp.einsum("nij,nj->ni", evidence.precision, evidence.y - frame.x)
         weight = self._weight(frame.error, s, evidence)[:, None]
-        push = jax.vjp(lambda y: self._unbalanced(y, s), frame.x)[1](weight * self._unbalanced(frame.x, s))[0]
+        push = jax.vjp(lambda y: self.unbalanced(y, s), frame.x)[1](weight * self.unbalanced(frame.x, s))[0]
         return solve(self.layout, frame.factor, pull - push)
 
 

@@ -79,7 +79,7 @@ class ImplicitFilter(Filter):
 
     def reconsider(self, belief: AttachmentBelief) -> Stated:
         """See `Filter.reconsider`: as few samples give it, which find most of what propagation misses in a grasp."""
-        return _sampled(belief, PASSING)
+        return reconsidered(belief)
 
     def release(self, belief: AttachmentBelief, *, thorough: bool = True) -> Stated | None:
         """The belief with all grasps linearised again that need it; the next frame begins another grasp.
@@ -164,6 +164,11 @@ def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
     stiffness = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=EVEN, partial=PARTIAL)
     prior = AttachmentPrior.build(mesh.n, mesh.edges, stiffness=stiffness, probability=PROBABILITY, coupling=COUPLING)
     return AttachmentBelief.before(prior, reference=reference)
+
+
+def reconsidered(belief: AttachmentBelief) -> Stated:
+    """The belief as a few samples give it."""
+    return _sampled(belief, PASSING)
 
 
 class _Grasp:

@@ -1,0 +1,235 @@
+"""Closing the loop: which effect the model lacks, added if frames that it never saw are foretold better with it.
+
+Fit with what is declared, score every effect at what is left, fit again with each of the likeliest from the start, take
+the one that explains most; keep it if it beats larger errors without a cause, if its size makes sense and if each
+grasp, left out of the fit, is foretold better. Again for a second and a third.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, cost_under, fit, gains_over, start
+from jiggle_mj.estimator.attribution.gather import Gathered
+from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
+from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
+from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.scores import Score, occam, scores
+from jiggle_mj.estimator.effects import LIBRARY, Effect
+
+LOOKED_AT = 3
+"""Effects that are fitted, the likeliest by their scores."""
+ENTER = 5.0
+"""Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
+LEAD = 3.0
+"""By how much it must lead the next to be named alone [nat]."""
+MOST = 3
+"""Effects that are added at most."""
+ABSURD = 3.5
+"""Prior standard deviations beyond which a parameter makes no sense."""
+FOLD_PASSES = 2
+"""Gauss-Newton steps where one grasp is left out of a fit that has found its end."""
+BETTER = 0.97
+"""Share of the error over all grasps left out that an effect must bring it to."""
+START = 2.0
+"""Prior standard deviations within which a fit begins."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """An effect, fitted."""
+
+    score: Score
+    effect: Effect
+    fitted: Fitted
+    log_bayes_factor: float
+    """Against the fit without it, the lesser under either's weights."""
+    theta: np.ndarray
+    sd: np.ndarray
+    left: Leftover | None = None
+    folds: list[Foretold] | None = None
+
+    @property
+    def sensible(self) -> bool:
+        """Whether its size is."""
+        return bool(np.all(np.abs(self.theta) <= ABSURD * np.asarray(self.effect.prior_sd)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """The loop before or after an effect was added."""
+
+    fitted: Fitted
+    left: Leftover
+    folds: list[Foretold]
+    """Each grasp that was fitted to, foretold by a fit without it; none if there are fewer than two."""
+    scores: list[Score]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Closed:
+    """What came of it."""
+
+    verdict: str
+    """One of `VERDICTS`."""
+    accepted: list[Trial]
+    rivals: list[Trial]
+    """Effects that the last one accepted could not be told from."""
+    refused: list[tuple[Trial, str]]
+    stages: list[Stage]
+    """The first with what is declared alone."""
+    reported: tuple[Foretold, Foretold] | None
+    """A grasp that decided nothing, foretold before and after; None if there was none to spare."""
+    problem: Problem
+
+
+VERDICTS = ("no-effect", "effect", "ambiguous", "effect-with-remainder", "unexplained")
+REMAINDER = 60.0
+"""What larger errors without a cause may gain before something is said to be left over [nat]."""
+
+
+def close_the_loop(
+    gathered: Gathered, *, library: tuple[Effect, ...] = LIBRARY, say: Callable[[str], None] = lambda _: None
+) -> Closed:
+    """Over a recording that was followed.
+
+    Args:
+        gathered: what was seen.
+        library: effects that the model may lack.
+        say: told what is being done.
+    """
+    problem = Problem.build(gathered, library)
+    grasps = list(dict.fromkeys(one.grasp for one in gathered.frames))
+    spare = grasps[-1] if len(grasps) > 1 else None
+    used = set(grasps) - {spare}
+    say(f"fitting {len(problem.frames(used))} frames of {len(used)} grasps with what is declared")
+    stages, accepted, refused, rivals = [_declared(problem, gathered, used, say)], [], [], []
+    while len(accepted) < MOST:
+        trials = _trials(problem, stages[-1], accepted, used, say)
+        best = None
+        for trial in trials:
+            judged = _judged(problem, trial, used)
+            why = _against(judged, stages[-1])
+            if why is None:
+                best = judged
+                break
+            refused.append((judged, why))
+            say(f"{trial.effect.name} refused: {why}")
+        if best is None:
+            break
+        accepted.append(best)
+        assert best.left is not None and best.folds is not None
+        stages.append(Stage(fitted=best.fitted, left=best.left, folds=best.folds, scores=[]))
+        rivals = [one for one in trials if one.effect is not best.effect and abs(_versus(problem, best, one)) < LEAD]
+        say(f"{best.effect.name} added")
+    reported = None
+    if spare is not None:
+        reported = foretell(problem, stages[0].fitted, spare), foretell(problem, stages[-1].fitted, spare)
+    return Closed(
+        verdict=_verdict(accepted, rivals, stages, refused),
+        accepted=accepted,
+        rivals=rivals,
+        refused=refused,
+        stages=stages,
+        reported=reported,
+        problem=problem,
+    )
+
+
+def _declared(problem: Problem, gathered: Gathered, used: set[int], say: Callable[[str], None]) -> Stage:
+    """The fit with no effect, from what the filter says."""
+    found, reference = gathered.detection, float(problem.sheet.balance.reference)
+    b = np.where(found.attached, found.stiffness, 0.0)
+    s = np.where(np.isinf(b), STIFFEST, np.minimum(b / (b + reference), STIFFEST))
+    states = np.array([one.state for one in gathered.frames])
+    point = start(problem, np.zeros(problem.sheet.size), s, states, problem.frames(used))
+    fitted = fit(problem, np.zeros(0, dtype=int), point, used, say=say)
+    return Stage(fitted=fitted, left=leftover(problem, fitted), folds=_folds(problem, fitted, used), scores=[])
+
+
+def _folds(problem: Problem, fitted: Fitted, used: set[int]) -> list[Foretold]:
+    if len(used) < 2:
+        return []
+    parts = []
+    for grasp in sorted(used):
+        without = fit(problem, fitted.named, fitted.point, used - {grasp}, passes=FOLD_PASSES)
+        parts.append(foretell(problem, without, grasp))
+    return parts
+
+
+def _trials(
+    problem: Problem, stage: Stage, accepted: list[Trial], used: set[int], say: Callable[[str], None]
+) -> list[Trial]:
+    """The likeliest effects, fitted, the best first, as far as they are worth a look."""
+    found = scores(problem, stage.fitted)
+    stage.scores.extend(found)
+    say("scores: " + ", ".join(f"{one.name} {one.log_bayes_factor:.1f}" for one in found[:6]))
+    likely = [one for one in found if one.log_bayes_factor > ENTER][:LOOKED_AT]
+    trials = [_fitted(problem, stage, one, accepted, used) for one in likely]
+    for one in trials:
+        say(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
+    trials = [one for one in trials if one.log_bayes_factor > ENTER]
+    wins = {one.effect.name: sum(_versus(problem, one, other) > 0 for other in trials) for one in trials}
+    return sorted(trials, key=lambda one: (not one.sensible, -wins[one.effect.name], -one.log_bayes_factor))
+
+
+def _versus(problem: Problem, one: Trial, other: Trial) -> float:
+    """Log Bayes factor of an effect against another, in the mean under the weights of both."""
+    volumes = [occam(problem, trial.fitted)[0] + np.log(trial.effect.sites) for trial in (one, other)]
+    return float(np.mean(gains_over(problem, one.fitted, other.fitted)) - volumes[0] + volumes[1])
+
+
+def _judged(problem: Problem, trial: Trial, used: set[int]) -> Trial:
+    """With what it leaves over and how it foretells."""
+    judged = {"left": leftover(problem, trial.fitted), "folds": _folds(problem, trial.fitted, used)}
+    return Trial(**{**vars(trial), **judged})
+
+
+def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial], used: set[int]) -> Trial:
+    effect = next(one for one in problem.sheet.library if one.name == score.name)
+    at = problem.sheet.place(effect.name, score.site)
+    named = np.concatenate([*(problem.sheet.place(one.effect.name, one.score.site) for one in accepted), at])
+    before, theta = stage.fitted, stage.fitted.point.theta.copy()
+    limit = START * problem.prior_sd[at]
+    theta[at] = np.clip(theta[at] + score.theta, 0.0 if effect.non_negative else -limit, limit)
+    point = start(problem, theta, before.point.s, before.point.states, problem.frames(used))
+    if cost_under(problem, before.weights, before.glances, point) > before.cost:
+        point = before.point  # a linear step that led astray
+    fitted = fit(problem, named.astype(int), point, used)
+    volume, sd = occam(problem, fitted)
+    gain = min(gains_over(problem, fitted, before)) - (volume - occam(problem, before)[0]) - np.log(effect.sites)
+    return Trial(
+        score=score,
+        effect=effect,
+        fitted=fitted,
+        log_bayes_factor=float(gain),
+        theta=fitted.point.theta[at],
+        sd=sd[-len(at) :],
+    )
+
+
+def _against(best: Trial, stage: Stage) -> str | None:
+    """Why an effect is not added; None if it is."""
+    assert best.left is not None and best.folds is not None
+    if not best.sensible:
+        return f"its size is beyond {ABSURD:g} prior standard deviations"
+    if best.log_bayes_factor + best.left.gain < stage.left.gain + ENTER:
+        return "larger errors without a cause explain the frames as well"
+    if stage.folds:
+        before, after = (Foretold.together(parts).rms for parts in (stage.folds, best.folds))
+        better = sum(b.rms < a.rms for a, b in zip(stage.folds, best.folds, strict=True))
+        if after > BETTER * before or 2 * better <= len(stage.folds):
+            return (
+                f"grasps left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
+                f"better in {better} of {len(stage.folds)}"
+            )
+    return None
+
+
+def _verdict(accepted: list[Trial], rivals: list[Trial], stages: list[Stage], refused: list[tuple[Trial, str]]) -> str:
+    left_over = stages[-1].left.gain > REMAINDER
+    if not accepted:
+        return "unexplained" if left_over else "no-effect"
+    if left_over:
+        return "effect-with-remainder"
+    return "ambiguous" if rivals else "effect"

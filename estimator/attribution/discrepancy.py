@@ -1,0 +1,75 @@
+"""What closing the loop found, as `discrepancy.json` holds it."""
+
+from typing import Any
+
+from jiggle_mj.estimator.attribution.closing import Closed, Trial
+from jiggle_mj.estimator.attribution.gather import Gathered
+from jiggle_mj.estimator.attribution.held_out import Foretold
+from jiggle_mj.estimator.attribution.localisation import localisation
+
+
+def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
+    """Numbers, strings and lists alone; lengths in metres, log Bayes factors in nat."""
+    first, last = closed.stages[0], closed.stages[-1]
+    noise = gathered.noise
+    return {
+        "verdict": closed.verdict,
+        "effects": [_effect(closed, one) for one in closed.accepted],
+        "ambiguous_with": [one.effect.name for one in closed.rivals],
+        "refused": [{"name": one.effect.name, "why": why} for one, why in closed.refused],
+        "tested": [effect.name for effect in closed.problem.sheet.library],
+        "scores": [
+            {
+                "name": one.name,
+                "log_bayes_factor": one.log_bayes_factor,
+                "p_value": one.p_value,
+                "information_kept": one.kept,
+            }
+            for one in first.scores
+        ],
+        "left_over": [
+            {"gain": one.left.gain, "force_variance": one.left.variance, "smooth_amplitude": one.left.amplitude}
+            for one in closed.stages
+        ],
+        "held_out": {
+            "folds": [
+                {"before_rms_m": before.rms, "after_rms_m": after.rms}
+                for before, after in zip(first.folds, last.folds, strict=True)
+            ],
+            **_reported(closed.reported),
+        },
+        "noise": {
+            "sd_m": noise.sd,
+            "smooth_sd_m": noise.smooth_sd,
+            "smooth_length_m": noise.length,
+            "still_frames": noise.frames,
+        },
+        "localisation": localisation(closed.problem, first.fitted),
+        "localisation_after": localisation(closed.problem, last.fitted),
+        "detection_before": None,
+        "detection_after": None,
+    }
+
+
+def _effect(closed: Closed, one: Trial) -> dict[str, Any]:
+    return {
+        "name": one.effect.name,
+        "site": one.score.site if one.effect.sites > 1 else None,
+        "theta": one.theta.tolist(),
+        "sd": one.sd.tolist(),
+        "units": list(one.effect.units),
+        "log_bayes_factor": one.log_bayes_factor,
+        "p_value": one.score.p_value,
+        "this_session_alone": one.effect.sensing,
+        "often_confused_with": list(one.effect.confounded_with),
+    }
+
+
+def _reported(reported: tuple[Foretold, Foretold] | None) -> dict[str, float | None]:
+    """On the grasp that decided nothing."""
+    figures: dict[str, float | None] = {}
+    for when, found in zip(("before", "after"), reported or (None, None), strict=True):
+        figures[f"{when}_rms_m"] = None if found is None else found.rms
+        figures[f"{when}_nll"] = None if found is None else found.nll
+        figures[f"{when}_coverage_90"] = None if found is None else found.coverage_90
+    return figures

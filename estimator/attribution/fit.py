@@ -1,0 +1,200 @@
+"""Stiffnesses and the parameters of some effects, fitted to a recording's predicted equilibria together.
+
+Gauss-Newton with the weights of the state at hand [iteratively reweighted: Green 1984, JRSS B 46:149]: a step is taken
+if it lessens the misfit under the weights that it was reckoned with, so that nothing is won by weights that forgive
+more. Stiffnesses go where samples of the belief say.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, glance, misfit
+from jiggle_mj.estimator.attribution.normal_equations import less_offset, reduced
+from jiggle_mj.estimator.attribution.problem import Point, Problem
+from jiggle_mj.estimator.attribution.sheet import predict_all
+from jiggle_mj.estimator.filters.implicit import reconsidered
+
+ODDS = 2.2
+"""What an attachment costs: the logarithm of nine to one [nat]."""
+STIFFEST = 0.98
+"""Largest bounded stiffness."""
+DIRECTIONS = 20
+"""Most parameters that are fitted together."""
+PASSES = 10
+"""Most Gauss-Newton steps."""
+SHORTER = (1.0, 0.4, 0.15, 0.05)
+"""Shares of a step that are tried."""
+FARTHEST, OWN_FARTHEST, FAR = 4.0, 3.0, 1.5
+"""Most that an effect's parameter and one of the sheet's own may be from 0, and that one may change in a step, in prior
+standard deviations."""
+GAIN = 1.0
+"""Of a step, below which the fit has come to its end [nat]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """The end of a fit."""
+
+    point: Point
+    named: np.ndarray
+    """Parameters of the effects that are taken to be there."""
+    free: np.ndarray
+    """All that were fitted, the sheet's own among them."""
+    square: Float[np.ndarray, "k k"]
+    """Normal equations there, over s, the free parameters and -1."""
+    glances: dict[int, Glance]
+    weights: dict[int, Metric]
+    """By frame."""
+    site_precision: Float[np.ndarray, " n"]
+    """How sure the belief is of each s besides what frames say."""
+    cost: float
+    """Twice the negative logarithm of likelihood and prior under its own weights [nat]."""
+
+
+def start(problem: Problem, theta: np.ndarray, s: np.ndarray, states: np.ndarray, frames: list[int]) -> Point:
+    """A point and what it predicts."""
+    states, seen = predict_all(problem.sheet, theta, s, problem.history, states, only=frames)
+    return Point(theta=theta, s=s, states=states, seen=seen)
+
+
+def fit(
+    problem: Problem,
+    named: np.ndarray,
+    point: Point,
+    grasps: set[int],
+    *,
+    passes: int = PASSES,
+    say: Callable[[str], None] = lambda _: None,
+) -> Fitted:
+    """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some grasps."""
+    now, step = _reckoned(problem, named, point, problem.frames(grasps))
+    for count in range(passes):
+        better = _shortened(problem, now, step)
+        if better is None:
+            break
+        trial, cost = better
+        say(f"pass {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
+        gained = now.cost - cost
+        now, step = _reckoned(problem, named, trial, problem.frames(grasps))
+        if gained < 2 * GAIN:
+            break
+    return now
+
+
+def _reckoned(
+    problem: Problem, named: np.ndarray, point: Point, frames: list[int]
+) -> tuple[Fitted, tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]]:
+    """A point with what is known there, and the step from it."""
+    free, sd = problem.free(named), problem.sd(named)
+    glances, weights = linearised(problem, point, frames, directions(problem, free, DIRECTIONS))
+    square = reduced(problem, glances, len(free))
+    step, sites = _step(problem, square, point, free, sd)
+    found = Fitted(
+        point=point,
+        named=named,
+        free=free,
+        square=square,
+        glances=glances,
+        weights=weights,
+        site_precision=sites,
+        cost=cost_under(problem, weights, glances, point) + _prior(point, free, sd),
+    )
+    return found, step
+
+
+def _shortened(
+    problem: Problem, now: Fitted, step: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
+) -> tuple[Point, float] | None:
+    """The longest share of a step that lessens the cost, and the cost there; None if none does."""
+    free, sd, point = now.free, problem.sd(now.named), now.point
+    most = np.where(np.arange(len(free)) < len(now.named), FARTHEST, OWN_FARTHEST) * sd
+    least = np.maximum(problem.least(free), -most)
+    for share in SHORTER:
+        theta = point.theta + share * step[0]
+        theta[free] = np.clip(theta[free], least, most)
+        s = np.clip(point.s + share * step[1], 0, STIFFEST)
+        trial = start(problem, theta, s, point.states, list(now.glances))
+        cost = cost_under(problem, now.weights, now.glances, trial) + _prior(trial, free, sd)
+        if cost < now.cost:
+            return trial, cost
+    return None
+
+
+def directions(problem: Problem, free: np.ndarray, width: int) -> Float[np.ndarray, "p width"]:
+    """Unit vectors along parameters, padded."""
+    along = np.zeros((problem.sheet.size, width))
+    along[free, np.arange(len(free))] = 1
+    return along
+
+
+def linearised(
+    problem: Problem, point: Point, frames: list[int], along: Float[np.ndarray, "p d"]
+) -> tuple[dict[int, Glance], dict[int, Metric]]:
+    """Every frame at a point."""
+    glances, weights = {}, {}
+    theta, s, noise, along_ = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise, along))
+    for k in frames:
+        moment = problem.history.moment(k, point.states)
+        frame, x = problem.history.frames[k].frame, jnp.asarray(point.states[k])
+        glances[k], weights[k] = glance(problem.sheet, theta, along_, s, frame, moment, x, noise)
+    return glances, weights
+
+
+def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
+    """By how much one fit explains the frames better than another, under its own weights and under the other's [nat].
+
+    Weights of different fits forgive different things, so that gains under one fit's alone do not compare.
+    """
+    gains = []
+    for judge in (better, plain):
+        costs = [
+            cost_under(problem, judge.weights, judge.glances, one.point)
+            + _prior(one.point, one.free, problem.sd(one.named))
+            for one in (plain, better)
+        ]
+        gains.append((costs[0] - costs[1]) / 2)
+    return gains[0], gains[1]
+
+
+def cost_under(problem: Problem, weights: dict[int, Metric], glances: dict[int, Glance], point: Point) -> float:
+    """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
+    total, theta = 0.0, jnp.asarray(point.theta)
+    for frames in problem.by_grasp(glances).values():
+        missed = []
+        for k in frames:
+            moment, frame = problem.history.moment(k, point.states), problem.history.frames[k].frame
+            missed.append(misfit(problem.sheet, weights[k], theta, frame, moment, jnp.asarray(point.states[k])))
+        tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
+        fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
+        middle = np.sum([np.asarray(glances[k].square)[-1 - N_FIELDS : -1, -1 - N_FIELDS : -1] for k in frames], axis=0)
+        middle += np.eye(N_FIELDS) / problem.amplitude**2
+        total += sum(float(one.squared) for one in missed) + less_offset(tool, tool)[0, 0]
+        total -= fields @ np.linalg.solve(middle, fields)
+    return float(total)
+
+
+def _step(
+    problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray
+) -> tuple[tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]:
+    """Of the parameters and of s, to what samples of the belief say and what fits that best; and the belief's sites."""
+    n, d = len(point.s), len(free)
+    A = square[n : n + d, n : n + d] + np.diag(sd**-2)
+    C, gs = square[:n, n : n + d], square[:n, -1]
+    gt = square[n : n + d, -1] + point.theta[free] / sd**2
+    L = square[:n, :n] - C @ np.linalg.solve(A, C.T)
+    shift = L @ point.s - gs + C @ np.linalg.solve(A, gt)
+    stated = reconsidered(problem.prior.add(jnp.asarray(L), jnp.asarray(shift)))
+    s = np.asarray(problem.prior.bounded(jnp.where(stated.probability > 0.5, stated.b, 0.0)))
+    theta = np.zeros(len(point.theta))
+    theta[free] = np.clip(-np.linalg.solve(A, gt + C.T @ (s - point.s)), -FAR * sd, FAR * sd)
+    assert isinstance(stated.belief, AttachmentBelief)
+    return (theta, s - point.s), np.asarray(stated.belief.site_precision)
+
+
+def _prior(point: Point, free: np.ndarray, sd: np.ndarray) -> float:
+    """Twice the logarithm of the prior, its constants left out."""
+    return 2 * ODDS * float(np.sum(point.s > 0)) + float(np.sum((point.theta[free] / sd) ** 2))

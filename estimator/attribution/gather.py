@@ -1,0 +1,113 @@
+"""A recording's frames with closed jaws, as the estimator saw them while it followed the recording."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, Timed
+from jiggle_mj.estimator.attribution.still_noise import StillNoise, measure
+from jiggle_mj.estimator.config import EstimatorConfig
+from jiggle_mj.estimator.estimator import Estimator
+
+from jiggle_mj.camera import StereoCamera
+from jiggle_mj.errors import PerceptionError
+from jiggle_mj.estimate import Detection, Estimate
+from jiggle_mj.observation import Declaration, MeasuredPoints, Observation
+
+ASSUMED = StillNoise(sd=2e-4, smooth_sd=2e-4, length=1.2e-2, frames=0)
+"""Where there are too few still frames."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gathered:
+    """All that a loop is closed over."""
+
+    estimator: Estimator
+    frames: list[Timed]
+    noise: StillNoise
+    detection: Detection
+    """With nothing but what is declared."""
+
+
+def gather(
+    declaration: Declaration,
+    camera: StereoCamera | None,
+    observations: Iterable[Observation],
+    *,
+    config: EstimatorConfig | None = None,
+    on_frame: Callable[[Estimate], None] = lambda _: None,
+) -> Gathered:
+    """Follow a recording.
+
+    Raises:
+        PerceptionError: no frame with closed jaws could be used.
+    """
+    estimator, frames, still = Estimator(declaration, camera, config=config), [], []
+    began: int | None = None
+    grasp, closed = -1, 0
+    for observation in observations:
+        found = estimator.update(observation)
+        if found is None:
+            if not frames and observation.points is not None:
+                still.append(observation.points)
+            began = observation.time if not frames else began
+            continue
+        if observation.tool.grasp != grasp:
+            grasp, closed = observation.tool.grasp, observation.time
+        began = observation.time if began is None else began
+        frames.append(_timed(estimator, observation, found, since=began, closed=closed))
+        on_frame(found)
+    if not frames:
+        raise PerceptionError("no frame with closed jaws could be used, so there is nothing to close the loop over.")
+    estimator.release()
+    noise = _noise_of(still, estimator) or ASSUMED
+    frames = [_weighed(one, noise.fields(estimator.sheet.rest)[1]) for one in frames]
+    return Gathered(estimator=estimator, frames=frames, noise=noise, detection=estimator.detection)
+
+
+def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, since: int, closed: int) -> Timed:
+    hold = estimator.hold
+    assert hold is not None
+    visible = np.all(np.isfinite(found.observed), axis=1)
+    with jax.enable_x64(True):
+        frame = ClosedFrame(
+            y=jnp.asarray(np.nan_to_num(found.observed)),
+            visible=jnp.asarray(visible),
+            precision=jnp.zeros((len(visible), 3, 3)),
+            held=jnp.asarray(hold.held),
+            loaded=jnp.asarray(estimator.loaded(hold.held)),
+            closed_at=jnp.asarray(hold.closed_at),
+            way=jnp.asarray(observation.tool.position - hold.tip),
+        )
+    return Timed(
+        frame=frame,
+        index=found.index,
+        grasp=observation.tool.grasp,
+        time=(found.time - since) / 1e9,
+        closed=(found.time - closed) / 1e9,
+        state=found.positions,
+    )
+
+
+def _weighed(one: Timed, sd: float) -> Timed:
+    """With the white noise's precision on what is seen."""
+    with jax.enable_x64(True):
+        precision = jnp.where(one.frame.visible[:, None, None], jnp.eye(3)[None] / sd**2, 0.0)
+    frame = ClosedFrame(**{**vars(one.frame), "precision": precision})
+    return Timed(**{**vars(one), "frame": frame})
+
+
+def _noise_of(still: list[MeasuredPoints], estimator: Estimator) -> StillNoise | None:
+    """From tracked points before the jaws close."""
+    ids = estimator.track_ids
+    if ids is None or not still:
+        return None
+    positions = np.full((len(still), len(ids), 3), np.nan)
+    for row, points in zip(positions, still, strict=True):
+        assert points.track_id is not None
+        place = {int(track): k for k, track in enumerate(points.track_id)}
+        known = [k for k, track in enumerate(ids) if int(track) in place]
+        row[known] = points.positions[[place[int(ids[k])] for k in known]]
+    return measure(positions, estimator.sheet.rest)

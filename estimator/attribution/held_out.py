@@ -1,0 +1,97 @@
+"""How well frames are foretold that a fit never saw, from what the tool says alone."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from jiggle_mj.estimator.attribution.fit import DIRECTIONS, Fitted, directions
+from jiggle_mj.estimator.attribution.linear import glance
+from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.sheet import predict_all
+from scipy.stats import norm
+
+ROUNDS = 2
+"""Passes over a grasp, so that its frames know the states of those before."""
+PINNED = 1e6
+"""Stiffness that stands for what is held [N/m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Foretold:
+    """A grasp's frames, particles that were seen and not held."""
+
+    off: Float[np.ndarray, "m 3"]
+    """Seen less foretold [m]."""
+    sd: Float[np.ndarray, "m 3"]
+    """Of that, as the fit has it [m]."""
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance [m]."""
+        return float(np.sqrt(np.mean(np.sum(self.off**2, axis=1))))
+
+    @property
+    def nll(self) -> float:
+        """Mean negative log likelihood of a coordinate [nat, lengths in m]."""
+        return float(np.mean(0.5 * (self.off / self.sd) ** 2 + np.log(self.sd) + 0.5 * np.log(2 * np.pi)))
+
+    @property
+    def coverage_90(self) -> float:
+        """Share of coordinates within their 90 % intervals."""
+        return float(np.mean(np.abs(self.off) <= norm.ppf(0.95) * self.sd))
+
+    @staticmethod
+    def together(parts: list["Foretold"]) -> "Foretold":
+        """Several grasps."""
+        return Foretold(off=np.concatenate([one.off for one in parts]), sd=np.concatenate([one.sd for one in parts]))
+
+
+def foretell(problem: Problem, fitted: Fitted, grasp: int) -> Foretold:
+    """One grasp that was not fitted to."""
+    frames, point = problem.frames({grasp}), fitted.point
+    rest = np.asarray(problem.history.rest)
+    states = np.where(np.isin(np.arange(len(point.states)), frames)[:, None, None], rest[None], point.states)
+    seen = states
+    for _ in range(ROUNDS):
+        states, seen = predict_all(
+            problem.sheet, point.theta, point.s, problem.history, states, only=frames, by_tool=True
+        )
+    off, sd = [], []
+    for k in frames:
+        frame = problem.history.frames[k].frame
+        counted = np.asarray(frame.visible & ~frame.held)
+        off.append((np.asarray(frame.y) - seen[k])[counted])
+        sd.append(_sd(problem, fitted, states, k)[counted])
+    return Foretold(off=np.concatenate(off), sd=np.concatenate(sd))
+
+
+def _sd(problem: Problem, fitted: Fitted, states: np.ndarray, k: int) -> Float[np.ndarray, "n 3"]:
+    """Of what is seen of each particle: the noise, the forces that the model gets wrong, s and the parameters."""
+    point, one = fitted.point, problem.history.frames[k]
+    arguments = (jnp.asarray(point.theta), jnp.asarray(directions(problem, fitted.free, DIRECTIONS)))
+    moment, x = problem.history.moment(k, states), jnp.asarray(states[k])
+    _, metric = glance(
+        problem.sheet, *arguments, jnp.asarray(point.s), one.frame, moment, x, jnp.asarray(problem.noise)
+    )
+    n, frame, held = len(point.s), metric.frame, np.asarray(one.frame.held)
+    rows = np.zeros((n + 1, 3, n + 1, 3))
+    neighbours = np.asarray(metric.balance.neighbours)
+    rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(np.asarray(frame.rows), 2, 3).swapaxes(2, 3)
+    H = rows[:n, :, :n].reshape(3 * n, 3 * n)
+    H[np.repeat(held, 3)] = 0.0
+    H[np.repeat(held, 3), np.repeat(held, 3)] = PINNED
+    inverse = np.linalg.inv(H)
+    force = np.where(held, 0.0, np.asarray(problem.sheet.balance.error(x)))
+    wrong = np.sum((inverse.reshape(3 * n, n, 3) * force[None, :, None]) ** 2, axis=(1, 2))
+    slope = np.where(held[:, None], 0.0, np.asarray(frame.slope))
+    response = np.einsum("ani,ni->an", inverse.reshape(3 * n, n, 3), slope)
+    d = len(fitted.free)
+    precision = fitted.square[:-1, :-1].copy()
+    precision[np.arange(n), np.arange(n)] += fitted.site_precision
+    precision[np.arange(n, n + d), np.arange(n, n + d)] += problem.sd(fitted.named) ** -2
+    known = np.linalg.inv(precision)[:n, :n]
+    unsure = np.einsum("an,nm,am->a", response, known, response)
+    white = 1 / np.maximum(np.asarray(one.frame.precision)[:, 0, 0], 1.0)
+    noise = white + np.sum(problem.noise**2, axis=1)
+    return np.sqrt(wrong.reshape(n, 3) + np.maximum(unsure, 0).reshape(n, 3) + noise[:, None])

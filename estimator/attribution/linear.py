@@ -1,0 +1,195 @@
+"""One frame linearised at its predicted state, and what is said there of attachments and effects together.
+
+With e = H (y - h(x)) + r, x the predicted equilibrium (so that r = 0 but for rounding), N the covariance of the forces
+that the model gets wrong and of the noise of what is seen, brought to forces by H,
+
+    e + D ds + G dtheta + Q c + H F a = n,    n ~ N(0, N),  a ~ N(0, I),  c ~ N(0, amplitude^2 I)
+
+with s the bounded stiffnesses, F the smooth fields of the noise, new in every frame, and Q smooth force fields in which
+anything might hide, the same in all frames of a grasp. a is eliminated frame by frame, c grasp by grasp. At a noisy
+state instead of the predicted one this would be an errors-in-variables problem, and invent effects.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
+from jiggle_mj.estimator.attribution.sheet import Sheet, look
+from jiggle_mj.estimator.block_tridiagonal import lower_square
+from jiggle_mj.estimator.effects.mechanical import flat
+from jiggle_mj.estimator.effects.sheet_model import Moment
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.force_balance import ForceBalance, Frame
+from jiggle_mj.estimator.membrane import TriangleMembrane
+
+WAVES = 4
+"""Cosines along each side of the sheet in the smooth force fields."""
+N_FIELDS = 3 * WAVES**2
+"""Smooth force fields, one for each direction of a cosine."""
+TOOL_SD = 2.5e-4
+"""How well the mean of the held particles follows the tool from frame to frame [m]."""
+GRASP_SD = 5e-4
+"""How well within a grasp as a whole: where exactly the jaws closed is not known [m]."""
+CARRIED = 1e12
+"""Precision of the state of what is held, which follows the grip exactly [1/m^2]."""
+
+
+class Metric(eqx.Module):
+    """How a frame's misfit is weighed: fixed while a fit looks for a better state."""
+
+    balance: ForceBalance
+    frame: Frame
+    seen: Float[Array, " n"]
+    """1 where a particle's position counts, 0 elsewhere."""
+    noise: Float[Array, "n 3 c"]
+    """N^-1 H F."""
+    spread: Float[Array, "c c"]
+    """I + F^T H^T N^-1 H F, its lower Cholesky factor."""
+    fields: Float[Array, "n 3 q"]
+    """Q."""
+
+    def dot(self, left: Float[Array, "n 3 l"], right: Float[Array, "n 3 r"]) -> Float[Array, "l r"]:
+        """left^T (N + H F F^T H^T)^-1 right."""
+        white = jax.vmap(lambda v: self.balance.whitened(self.frame, v), in_axes=2, out_axes=2)(right)
+        return self._less(left, right, jnp.einsum("nil,nir->lr", left, white))
+
+    def forces(self, off: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """H (y - h(x)) for what is seen off the prediction."""
+        return self.balance.apply(self.frame.rows, self.seen[:, None] * off)
+
+    def log_determinant(self) -> Float[Array, ""]:
+        """Ln |N + H F F^T H^T| for a given H and precision of what is seen, up to a constant."""
+        w, factor = self.frame.weight, self.frame.factor
+        diagonals = [jnp.diagonal(part, axis1=-2, axis2=-1) for part in (factor.inverse, factor.middle)]
+        roots = [jnp.sum(jnp.log(jnp.abs(one))) for one in diagonals]
+        force = jnp.sum(jnp.where(w > 0, 3 * jnp.log(jnp.where(w > 0, w, 1.0)), 0.0))
+        return -2 * (roots[0] + roots[1]) - force + 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
+
+    def _less(self, left, right, whole: Float[Array, "l r"]) -> Float[Array, "l r"]:
+        a, b = (jnp.einsum("nic,nik->ck", self.noise, side) for side in (left, right))
+        solved = jax.scipy.linalg.cho_solve((self.spread, True), b)
+        return whole - a.T @ solved
+
+
+class Glance(eqx.Module):
+    """One frame's normal equations: over s, then theta in given directions, then Q's fields, then -1 for e itself."""
+
+    square: Float[Array, "k k"]
+    """(n + directions + fields + 1) squared."""
+    tool: Float[Array, "3 j"]
+    """Rows of what the tool says of the held particles, over theta, fields (zero) and e, in units of `TOOL_SD`."""
+
+
+class Misfit(eqx.Module):
+    """How a frame's prediction misses what was seen, under a metric."""
+
+    squared: Float[Array, ""]
+    fields: Float[Array, " q"]
+    """Q^T N^-1 e."""
+    tool: Float[Array, " 3"]
+    """In units of `TOOL_SD`."""
+
+
+@eqx.filter_jit
+def glance(
+    sheet: Sheet,
+    theta: Float[Array, " p"],
+    directions: Float[Array, "p d"],
+    s: Float[Array, " n"],
+    frame: ClosedFrame,
+    moment: Moment,
+    x: Float[Array, "n 3"],
+    noise: Float[Array, "n modes"],
+) -> tuple[Glance, Metric]:
+    """Linearise a frame at its predicted state x; `noise` are the smooth fields of what is seen [m]."""
+    model = sheet.model(theta, moment, frame.way)
+    balance = sheet.balance_of(model.energy)
+    counted = frame.visible & ~frame.held
+    precision = jnp.where(frame.held[:, None, None], CARRIED * jnp.eye(3)[None], frame.precision)
+    evidence = Evidence(y=x, precision=precision, held=frame.held, loaded=frame.loaded)
+    linear = balance.linearise(x, s, evidence)
+    apply = jax.vmap(lambda v: balance.apply(linear.rows, v), in_axes=2, out_axes=2)
+    fields = _fields(model.term(TriangleMembrane), sheet.balance.energy.rest, linear.error)
+    smooth = noise[:, None, :, None] * jnp.eye(3)[None, :, None, :]
+    smooth = apply(jnp.where(counted[:, None, None], smooth.reshape(len(s), 3, -1), 0.0))
+    white = jax.vmap(lambda v: balance.whitened(linear, v), in_axes=2, out_axes=2)(smooth)
+    spread = jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white))
+    metric = Metric(
+        balance=balance, frame=linear, seen=counted.astype(float), noise=white, spread=spread, fields=fields
+    )
+
+    def along(u):
+        changed = sheet.model(theta + directions @ u, moment, frame.way)
+        unbalanced = sheet.balance_of(changed.energy).unbalanced(x, s)
+        return unbalanced, look(changed, x, moment), changed.tool
+
+    push, shown, taken = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
+    held = jnp.sum(jnp.where((frame.held & frame.visible)[:, None, None], shown, 0.0), axis=0) / _held_count(frame)
+    moved = jnp.where(counted[:, None, None], shown, jnp.where(frame.held[:, None, None], held[None], 0.0))
+    e = metric.forces(frame.y - look(model, x, moment)) + linear.unbalanced
+    columns = jnp.concatenate([push - apply(moved), fields, e[:, :, None]], axis=2)
+    square = _whole(metric, columns)
+    tool = jnp.concatenate([-held - taken, jnp.zeros((3, N_FIELDS)), _tool_off(frame, model, x, moment)[:, None]], 1)
+    return Glance(square=square, tool=jnp.where(moment.closed > 0, tool / TOOL_SD, 0.0)), metric
+
+
+@eqx.filter_jit
+def misfit(
+    sheet: Sheet,
+    metric: Metric,
+    theta: Float[Array, " p"],
+    frame: ClosedFrame,
+    moment: Moment,
+    x: Float[Array, "n 3"],
+) -> Misfit:
+    """Of another prediction x of the same frame."""
+    model = sheet.model(theta, moment, frame.way)
+    e = metric.forces(frame.y - look(model, x, moment))[:, :, None]
+    against = metric.dot(jnp.concatenate([metric.fields, e], axis=2), e)[:, 0]
+    tool = _tool_off(frame, model, x, moment) / TOOL_SD
+    return Misfit(squared=against[-1], fields=against[:-1], tool=jnp.where(moment.closed > 0, tool, 0.0))
+
+
+def _whole(metric: Metric, columns: Float[Array, "n 3 k"]) -> Float[Array, "_k _k"]:
+    """Inner products of D's columns, one a particle, and of others."""
+    balance, frame = metric.balance, metric.frame
+    w, slope, layout, n = frame.weight, frame.slope, balance.layout, len(frame.s)
+    rows = jnp.einsum("npij,n,ni->npj", frame.rows, w, slope)
+    padded = layout.n_blocks * layout.width
+    slot = jnp.append(jnp.asarray(layout.slot), padded)[balance.neighbours]
+    V = jnp.zeros((padded + 1, 3, padded)).at[slot, :, jnp.asarray(layout.slot)[:, None]].add(rows)[:-1]
+    square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
+    own = jnp.diag(w * jnp.sum(slope**2, axis=1)) - square[layout.slot][:, layout.slot]
+    shared = jnp.einsum("ni,nic->cn", slope, metric.noise)
+    own = own - shared.T @ jax.scipy.linalg.cho_solve((metric.spread, True), shared)
+    white = jax.vmap(lambda v: balance.whitened(frame, v), in_axes=2, out_axes=2)(columns)
+    others = jnp.einsum("nic,nik->ck", metric.noise, columns)
+    solved = jax.scipy.linalg.cho_solve((metric.spread, True), others)
+    between = jnp.einsum("ni,nik->nk", slope, white) - shared.T @ solved
+    among = jnp.einsum("nij,nik->jk", columns, white) - others.T @ solved
+    k = columns.shape[2]
+    whole = jnp.zeros((n + k, n + k)).at[:n, :n].set(own).at[:n, n:].set(between)
+    return whole.at[n:, :n].set(between.T).at[n:, n:].set(among)
+
+
+def _fields(
+    membrane: TriangleMembrane, rest: Float[Array, "n 3"], error: Float[Array, " n"]
+) -> Float[Array, "n 3 fields"]:
+    """Cosines over the sheet in each direction, of the force error's size."""
+    wave = jnp.cos(np.pi * jnp.arange(float(WAVES))[None, :, None] * flat(membrane, rest, rest)[:, None, :])
+    cosines = (wave[:, :, None, 0] * wave[:, None, :, 1]).reshape(len(rest), WAVES**2)
+    along = error[:, None, None, None] * cosines[:, None, :, None] * jnp.eye(3)[None, :, None, :]
+    return along.reshape(len(rest), 3, N_FIELDS)
+
+
+def _tool_off(frame: ClosedFrame, model, x: Float[Array, "n 3"], moment: Moment) -> Float[Array, " 3"]:
+    """By how much what is held has gone further than the tool says [m]."""
+    both = (frame.held & frame.visible)[:, None]
+    gone = jnp.sum(jnp.where(both, x + frame.y - look(model, x, moment) - frame.closed_at, 0.0), axis=0)
+    return jnp.where(jnp.any(both), gone / _held_count(frame) - model.tool, 0.0)
+
+
+def _held_count(frame: ClosedFrame) -> Float[Array, ""]:
+    return jnp.maximum(jnp.sum(frame.held & frame.visible, dtype=float), 1.0)

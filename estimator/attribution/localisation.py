@@ -1,0 +1,74 @@
+"""Where and when a fit misses what was seen, and what that goes with: for a person to look at, not to decide by."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from jiggle_mj.estimator.attribution.fit import Fitted
+from jiggle_mj.estimator.attribution.problem import Problem
+from scipy.stats import spearmanr
+
+
+def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
+    """By frame and by particle, and rank correlations of the distance with what might cause it.
+
+    Returns:
+        frames: index, grasp, time [s], rms [m]; particles: rest [m] and mean off, seen less predicted [m], null where
+        never seen; goes_with: Spearman's correlation of |off| over frames and particles with each regressor.
+    """
+    frames, rest = list(fitted.glances), np.asarray(problem.history.rest)
+    off = np.full((len(frames), len(rest), 3), np.nan)
+    for row, k in zip(off, frames, strict=True):
+        frame = problem.history.frames[k].frame
+        counted = np.asarray(frame.visible & ~frame.held)
+        row[counted] = (np.asarray(frame.y) - fitted.point.seen[k])[counted]
+    seen = np.asarray(np.isfinite(off).all(axis=2))
+    ever = np.asarray(seen.any(axis=0))
+    distance = np.linalg.norm(off, axis=2)
+    mean = np.divide(np.nansum(off, axis=0), seen.sum(axis=0)[:, None], where=ever[:, None], out=np.zeros_like(rest))
+    return {
+        "frames": [
+            {
+                "index": problem.history.frames[k].index,
+                "grasp": problem.history.frames[k].grasp,
+                "time_s": problem.history.frames[k].time,
+                "rms_m": float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else None,
+            }
+            for k, row in zip(frames, distance, strict=True)
+        ],
+        "particles": {
+            "rest_m": rest.tolist(),
+            "mean_off_m": [one.tolist() if known else None for one, known in zip(mean, ever, strict=True)],
+        },
+        "goes_with": {
+            name: _rank_correlation(distance, values) for name, values in _regressors(problem, fitted, frames).items()
+        },
+    }
+
+
+def _regressors(problem: Problem, fitted: Fitted, frames: list[int]) -> dict[str, Float[np.ndarray, "frames n"]]:
+    """What might cause a miss, for each particle in each frame."""
+    history, rest = problem.history, np.asarray(problem.history.rest)
+    states = fitted.point.states[frames]
+    moved = states - rest[None]
+    before = np.stack([np.asarray(history.moment(k, fitted.point.states).before) for k in frames])
+    spread = np.ones(len(rest))[None]
+    held = np.stack([np.asarray(history.frames[k].frame.held) for k in frames])
+    grip = np.stack([rest[one].mean(axis=0) if one.any() else np.full(3, np.nan) for one in held])
+    return {
+        "height": moved[:, :, 2],
+        "way from rest": np.linalg.norm(moved, axis=2),
+        "step since the frame before": np.linalg.norm(states - before, axis=2),
+        "being let down": (before - states)[:, :, 2],
+        "distance to the grip": np.linalg.norm(rest[None] - grip[:, None], axis=2),
+        "time since the jaws closed": np.array([history.frames[k].closed for k in frames])[:, None] * spread,
+        "time since the start": np.array([history.frames[k].time for k in frames])[:, None] * spread,
+        "attachment": np.broadcast_to(fitted.point.s[None], moved.shape[:2]),
+    }
+
+
+def _rank_correlation(distance: Float[np.ndarray, "f n"], values: Float[np.ndarray, "f n"]) -> float | None:
+    both = np.isfinite(distance) & np.isfinite(values)
+    if both.sum() < 3 or np.ptp(values[both]) == 0:
+        return None
+    return float(np.asarray(spearmanr(distance[both], values[both]))[0])

@@ -1,0 +1,29 @@
+"""Frames' normal equations added up, with what is common to a grasp eliminated."""
+
+import numpy as np
+from jaxtyping import Float
+from jiggle_mj.estimator.attribution.linear import GRASP_SD, N_FIELDS, TOOL_SD, Glance
+from jiggle_mj.estimator.attribution.problem import Problem
+
+
+def reduced(problem: Problem, glances: dict[int, Glance], d: int) -> Float[np.ndarray, "k k"]:
+    """Over s, the first d directions and -1."""
+    total: np.ndarray | float = 0.0
+    for frames in problem.by_grasp(glances).values():
+        whole = np.sum([np.asarray(glances[k].square) for k in frames], axis=0)
+        rows = np.array([np.asarray(glances[k].tool) for k in frames])
+        n = len(whole) - rows.shape[2]
+        whole[n:, n:] += less_offset(rows, rows)
+        left = np.r_[0 : n + d, len(whole) - 1]
+        fields = np.arange(len(whole) - 1 - N_FIELDS, len(whole) - 1)
+        middle = whole[np.ix_(fields, fields)] + np.eye(N_FIELDS) / problem.amplitude**2
+        beside = whole[np.ix_(fields, left)]
+        total = total + whole[np.ix_(left, left)] - beside.T @ np.linalg.solve(middle, beside)
+    return np.asarray(total)
+
+
+def less_offset(left: Float[np.ndarray, "t 3 a"], right: Float[np.ndarray, "t 3 b"]) -> Float[np.ndarray, "a b"]:
+    """Products of the tool's rows over a grasp's frames, an offset common to them eliminated."""
+    ratio = (GRASP_SD / TOOL_SD) ** 2
+    share = ratio / (1 + ratio * len(left))
+    return np.einsum("tia,tib->ab", left, right) - share * np.einsum("ia,ib->ab", left.sum(0), right.sum(0))

@@ -1,0 +1,104 @@
+"""What a loop is closed over: the sheet, its frames, the noise, and what is believed beforehand."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.attribution.closed_frames import History
+from jiggle_mj.estimator.attribution.gather import Gathered
+from jiggle_mj.estimator.attribution.sheet import Sheet
+from jiggle_mj.estimator.effects.effect import Effect
+from jiggle_mj.estimator.effects.sheet_model import centred, undisturbed
+from jiggle_mj.estimator.filters.build import force_balance
+from jiggle_mj.estimator.filters.implicit import prior_belief
+from jiggle_mj.estimator.mesh import SheetMesh
+
+OWN = {"stretch": (0.05,), "bending": (0.3,), "friction": (0.05,)}
+"""What may be a little off in any sheet, and is no effect: standard deviations in the effects' units."""
+FORCE_VARIANCE = 0.04
+"""Share of the filter's force variance that is left when what is the same in all frames of a grasp goes to smooth force
+fields: the likeliest on recordings of the reference with nothing undeclared in them."""
+AMPLITUDE = 0.2
+"""Of those fields, in units of the force error; the likeliest on the same."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """What is fitted to."""
+
+    sheet: Sheet
+    history: History
+    prior: AttachmentBelief
+    noise: Float[np.ndarray, "n modes"]
+    """Smooth fields of what is seen [m]."""
+    prior_sd: Float[np.ndarray, " p"]
+    """Of all the library's parameters, where they are an effect's."""
+    own: np.ndarray
+    """Parameters that are free in any case."""
+    own_sd: Float[np.ndarray, " own"]
+    amplitude: float = AMPLITUDE
+
+    @classmethod
+    def build(cls, gathered: Gathered, library: tuple[Effect, ...]) -> "Problem":
+        """For a recording and what the model may lack."""
+        estimator = gathered.estimator
+        mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
+        energy = undisturbed(mesh, estimator.declaration)
+        balance = force_balance(mesh, energy, estimator.declaration, estimator.config).widened(FORCE_VARIANCE)
+        sheet = Sheet(balance=balance, view=centred(mesh.rest), library=library)
+        own = {name: sd for name, sd in OWN.items() if any(effect.name == name for effect in library)}
+        return cls(
+            sheet=sheet,
+            history=History(gathered.frames, mesh.rest),
+            prior=prior_belief(mesh, reference=float(balance.reference)),
+            noise=gathered.noise.fields(mesh.rest)[0],
+            prior_sd=np.concatenate([np.tile(effect.prior_sd, effect.sites) for effect in library]),
+            own=np.concatenate([sheet.place(name) for name in own]).astype(int),
+            own_sd=np.concatenate([np.asarray(sd) for sd in own.values()]),
+        )
+
+    def widened(self, variance: float, amplitude: float) -> "Problem":
+        """With that many times the variance of the forces, and smooth fields of another amplitude."""
+        sheet = eqx.tree_at(lambda one: one.balance, self.sheet, self.sheet.balance.widened(variance))
+        return Problem(**{**vars(self), "sheet": sheet, "amplitude": amplitude})
+
+    def frames(self, grasps: Iterable[int]) -> list[int]:
+        """Frames of some grasps."""
+        return [k for k, one in enumerate(self.history.frames) if one.grasp in set(grasps)]
+
+    def by_grasp(self, frames: Iterable[int]) -> dict[int, list[int]]:
+        """Frames sorted by grasp."""
+        by_grasp: dict[int, list[int]] = {}
+        for k in frames:
+            by_grasp.setdefault(self.history.frames[k].grasp, []).append(k)
+        return by_grasp
+
+    def free(self, named: np.ndarray) -> np.ndarray:
+        """Named parameters, and the sheet's own."""
+        return np.concatenate([named, [k for k in self.own if k not in named]]).astype(int)
+
+    def sd(self, named: np.ndarray) -> Float[np.ndarray, " free"]:
+        """Prior standard deviations of `free`."""
+        narrow = [sd for k, sd in zip(self.own, self.own_sd, strict=True) if k not in named]
+        return np.concatenate([self.prior_sd[named], narrow])
+
+    def least(self, free: np.ndarray) -> Float[np.ndarray, " free"]:
+        """The least that each may be."""
+        lowest = [np.full(one.size, 0.0 if one.non_negative else -np.inf) for one in self.sheet.library]
+        return np.concatenate(lowest)[free]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """Where a fit is."""
+
+    theta: Float[np.ndarray, " p"]
+    s: Float[np.ndarray, " n"]
+    """Bounded stiffnesses."""
+    states: Float[np.ndarray, "frames n 3"]
+    """As predicted [m]."""
+    seen: Float[np.ndarray, "frames n 3"]
+    """The same as the camera shows it; NaN in frames that were not predicted."""

@@ -1,0 +1,139 @@
+"""Which effects a fit's misfit looks like: score statistics at the fit, with all that may vary anyway marginalised.
+
+With V the information about an effect's parameters that is left when stiffnesses, the sheet's own parameters and smooth
+force fields are marginalised, g its score and theta ~ N(0, Theta) before,
+
+    ln BF = g^T (V + Theta^-1)^-1 g / 2 - ln |I + Theta V| / 2
+
+for each place where it may be, and the mean of the BFs over the places.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from jiggle_mj.estimator.attribution.fit import Fitted, directions, linearised
+from jiggle_mj.estimator.attribution.normal_equations import reduced
+from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.effects.effect import Effect
+from scipy.stats import chi2
+
+TOGETHER = 76
+"""Parameters that are looked at together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """Of one effect."""
+
+    name: str
+    log_bayes_factor: float
+    """Against its absence, linearly."""
+    site: int
+    """Where it is likeliest."""
+    theta: Float[np.ndarray, " p"]
+    """By how much its parameters there would change, in one linear step."""
+    p_value: float
+    """Of the score statistic where the effect is absent, for the best of all its places."""
+    kept: float
+    """Share of the information about it that is left in the worst direction when the rest is marginalised."""
+
+
+def scores(problem: Problem, fitted: Fitted) -> list[Score]:
+    """Every effect of the library that was not fitted already, the likeliest first."""
+    n = len(fitted.site_precision)
+    found: dict[str, list[Score]] = {}
+    always = fitted.free
+    for pack in _packs(problem, fitted):
+        columns = np.concatenate([always, *(np.setdiff1d(at, always) for _, _, at in pack)]).astype(int)
+        along = directions(problem, columns, TOGETHER)
+        glances, _ = linearised(problem, fitted.point, list(fitted.glances), along)
+        square = reduced(problem, glances, len(columns))
+        beside = square[n:, :n]
+        left = square[n:, n:] - beside @ np.linalg.solve(square[:n, :n] + np.diag(fitted.site_precision), beside.T)
+        for effect, site, at in pack:
+            mine = np.array([list(columns).index(k) for k in at])
+            found.setdefault(effect.name, []).append(
+                _one(problem, fitted, effect, site, left, square[n:, n:], mine, columns)
+            )
+    return sorted(map(_best, found.values()), key=lambda one: -one.log_bayes_factor)
+
+
+def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " named"]]:
+    """Ln |I + Theta V| / 2 of a fit's named parameters, and their standard deviations."""
+    if not len(fitted.named):
+        return 0.0, np.zeros(0)
+    n, d = len(fitted.site_precision), len(fitted.named)
+    beside = fitted.square[n:-1, :n]
+    inner = fitted.square[:n, :n] + np.diag(fitted.site_precision)
+    left = fitted.square[n:-1, n:-1] - beside @ np.linalg.solve(inner, beside.T)
+    sd = problem.sd(fitted.named)
+    own = left[d:, d:] + np.diag(sd[d:] ** -2)
+    V = left[:d, :d] - left[:d, d:] @ np.linalg.solve(own, left[d:, :d])
+    unit = V * np.outer(sd[:d], sd[:d]) + np.eye(d)
+    return 0.5 * float(np.linalg.slogdet(unit)[1]), sd[:d] * np.sqrt(np.diag(np.linalg.inv(unit)))
+
+
+def _one(
+    problem: Problem,
+    fitted: Fitted,
+    effect: Effect,
+    site: int,
+    left: np.ndarray,
+    whole: np.ndarray,
+    mine: np.ndarray,
+    columns: np.ndarray,
+) -> Score:
+    sd_of = dict(zip(fitted.free, problem.sd(fitted.named), strict=True))
+    rest = np.array([k for k in range(len(fitted.free)) if k not in mine], dtype=int)
+    sd_rest = np.array([sd_of[columns[k]] for k in rest])
+    at = fitted.point.theta[columns]
+    free = left[np.ix_(rest, rest)] + np.diag(sd_rest**-2)
+    pulled = left[np.ix_(rest, np.append(mine, len(left) - 1))]
+    pulled[:, -1] += at[rest] / sd_rest**2
+    pull = np.linalg.solve(free, pulled)
+    V = left[np.ix_(mine, mine)] - left[np.ix_(mine, rest)] @ pull[:, :-1]
+    g = -(left[mine, -1] - left[np.ix_(mine, rest)] @ pull[:, -1])
+    sd = problem.prior_sd[columns[mine]]
+    unit, scaled, eye = V * np.outer(sd, sd), g * sd, np.eye(len(mine))
+    theta = np.linalg.solve(unit + eye, scaled)
+    senseless = effect.non_negative and theta[0] < 0
+    evidence = (0.0 if senseless else 0.5 * scaled @ theta) - 0.5 * np.linalg.slogdet(eye + unit)[1]
+    faint = 1e-9 * max(float(np.trace(unit)), 1e-30)
+    statistic = float(scaled @ np.linalg.solve(unit + faint * eye, scaled))
+    raw = whole[np.ix_(mine, mine)] * np.outer(sd, sd)
+    kept = np.linalg.eigvals(np.linalg.solve(raw + 1e-9 * max(np.trace(raw), 1e-30) * eye, unit)).real.min()
+    return Score(
+        name=effect.name,
+        log_bayes_factor=float(evidence),
+        site=site,
+        theta=sd * theta,
+        p_value=float(chi2.sf(statistic, len(mine))),
+        kept=float(np.clip(kept, 0, 1)),
+    )
+
+
+def _best(sites: list[Score]) -> Score:
+    evidence = np.array([one.log_bayes_factor for one in sites])
+    best = sites[int(np.argmax(evidence))]
+    mean = best.log_bayes_factor + float(np.log(np.mean(np.exp(evidence - evidence.max()))))
+    any_of = min(1.0, best.p_value * len(sites))
+    return Score(**{**vars(best), "log_bayes_factor": mean, "p_value": any_of})
+
+
+def _packs(problem: Problem, fitted: Fitted) -> list[list[tuple[Effect, int, np.ndarray]]]:
+    """Effects' sites, as many together as there is room for."""
+    packs: list[list[tuple[Effect, int, np.ndarray]]] = [[]]
+    room = TOGETHER - len(fitted.free)
+    for effect in problem.sheet.library:
+        if np.isin(problem.sheet.place(effect.name), fitted.named).any():
+            continue
+        for site in range(effect.sites):
+            at = problem.sheet.place(effect.name, site)
+            new = len(np.setdiff1d(at, fitted.free))
+            if new > room:
+                packs.append([])
+                room = TOGETHER - len(fitted.free)
+            room -= new
+            packs[-1].append((effect, site, at))
+    return packs

@@ -1,0 +1,121 @@
+"""The sheet with all effects of a library in it: where it goes and how that is seen."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, History
+from jiggle_mj.estimator.effects.effect import Effect
+from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, View, tangents
+from jiggle_mj.estimator.energy import SheetEnergy
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.membrane import TriangleMembrane
+
+GRIPPED = 1e6
+"""Precision with which the grip carries what it holds while a state is predicted [1/m^2]."""
+
+
+class Sheet(eqx.Module):
+    """One sheet and what it may lack."""
+
+    balance: ForceBalance
+    view: View
+    library: tuple[Effect, ...] = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """How many parameters the library has."""
+        return sum(effect.size for effect in self.library)
+
+    def place(self, name: str, site: int | None = None) -> np.ndarray:
+        """Where an effect's parameters are, at one site or at all."""
+        start = 0
+        for effect in self.library:
+            if effect.name == name:
+                at = np.arange(start, start + effect.size)
+                return at if site is None else at.reshape(effect.sites, -1)[site]
+            start += effect.size
+        raise ValueError(f"there is no effect {name!r}; there are {[one.name for one in self.library]}.")
+
+    def model(self, theta: Float[Array, " p"], moment: Moment, way: Float[Array, " 3"]) -> SheetModel:
+        """Of one frame, with effects of those sizes."""
+        model, start = SheetModel(energy=self.balance.energy, tool=way, view=self.view), 0
+        for effect in self.library:
+            model = effect.acts(model, theta[start : start + effect.size], moment)
+            start += effect.size
+        return model
+
+    def balance_of(self, energy: SheetEnergy) -> ForceBalance:
+        """The balance of forces for a changed energy."""
+        springs = self.balance.tethered.energy.terms[-1]
+        changed = energy, energy.rest, (*energy.terms, springs)
+        return eqx.tree_at(lambda b: (b.energy, b.tethered.energy.rest, b.tethered.energy.terms), self.balance, changed)
+
+
+def look(model: SheetModel, x: Float[Array, "n 3"], moment: Moment) -> Float[Array, "n 3"]:
+    """Where particles at x are seen."""
+    return model.view(x, before=moment.before, tangents=tangents(model.term(TriangleMembrane), x))
+
+
+def held_way(model: SheetModel, frame: ClosedFrame, x: Float[Array, "n 3"], moment: Moment) -> Float[Array, " 3"]:
+    """How far the held particles have gone as seen, the view's errors taken off [m]; as the tool says if none is."""
+    both = frame.held & frame.visible
+    gone = jnp.where(both[:, None], x + frame.y - look(model, x, moment) - frame.closed_at, 0.0)
+    return jnp.where(jnp.any(both), jnp.sum(gone, axis=0) / jnp.maximum(jnp.sum(both, dtype=float), 1.0), model.tool)
+
+
+class Predicted(eqx.Module):
+    """One frame."""
+
+    x: Float[Array, "n 3"]
+    seen: Float[Array, "n 3"]
+    """x as the camera shows it."""
+
+
+@eqx.filter_jit
+def predict(
+    sheet: Sheet,
+    theta: Float[Array, " p"],
+    s: Float[Array, " n"],
+    frame: ClosedFrame,
+    moment: Moment,
+    start: Float[Array, "n 3"],
+    by_tool: Bool[Array, ""],
+) -> Predicted:
+    """The equilibrium, searched from `start`; what is held goes where it was seen, or where the tool says."""
+    model = sheet.model(theta, moment, frame.way)
+    way = jnp.where(by_tool, model.tool, held_way(model, frame, start, moment))
+    to = frame.closed_at + way[None]
+    precision = jnp.broadcast_to(GRIPPED * jnp.eye(3)[None], (len(s), 3, 3))
+    gripped = Evidence(y=to, precision=precision, held=frame.held, loaded=frame.loaded)
+    begun = jnp.where(frame.held[:, None], to, start)
+    x = sheet.balance_of(model.energy).predict(begun, s, gripped)
+    return Predicted(x=x, seen=look(model, x, moment))
+
+
+def predict_all(
+    sheet: Sheet,
+    theta: np.ndarray,
+    s: np.ndarray,
+    history: History,
+    states: Float[np.ndarray, "frames n 3"],
+    *,
+    only: list[int] | None = None,
+    by_tool: bool = False,
+) -> tuple[Float[np.ndarray, "frames n 3"], Float[np.ndarray, "frames n 3"]]:
+    """Every frame in turn, from the states known so far; and how they are seen, NaN where they were not predicted."""
+    states, seen = states.copy(), np.full(states.shape, np.nan)
+    for k in range(len(history.frames)) if only is None else only:
+        one = history.frames[k]
+        found = predict(
+            sheet,
+            jnp.asarray(theta),
+            jnp.asarray(s),
+            one.frame,
+            history.moment(k, states),
+            jnp.asarray(states[k]),
+            jnp.asarray(by_tool),
+        )
+        states[k], seen[k] = np.asarray(found.x), np.asarray(found.seen)
+    return states, seen

@@ -1,0 +1,139 @@
+"""One sheet's model for one frame, as far as an effect may change it: its energy, its tool, and how it is seen.
+
+The energy has its terms by kind, so that an effect finds the one that it changes; terms that only effects use are there
+from the start, at nothing.
+"""
+
+from typing import TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from jiggle_mj.estimator.block_tridiagonal import Layout
+from jiggle_mj.estimator.effects.terms import Film, Load, Rub
+from jiggle_mj.estimator.energy import SheetEnergy, Term
+from jiggle_mj.estimator.environment import Tether, Weight
+from jiggle_mj.estimator.membrane import TriangleMembrane
+from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.surrogate import surrogate
+
+from jiggle_mj.observation import Declaration
+
+Kind = TypeVar("Kind", bound=Term)
+
+
+class View(eqx.Module):
+    """How positions are seen: `shift` + `centre` + `turn` (x - `centre`), after what lags and slips."""
+
+    centre: Float[Array, " 3"]
+    """The middle of the sheet at rest [m]."""
+    turn: Float[Array, "3 3"]
+    shift: Float[Array, " 3"]
+    """[m]."""
+    lag: Float[Array, ""]
+    """Share of the way back to the frame before."""
+    slip: Float[Array, " 2"]
+    """How far what is followed has slid over the sheet, along its two material axes [m]."""
+
+    def __call__(
+        self, x: Float[Array, "n 3"], *, before: Float[Array, "n 3"], tangents: Float[Array, "n 3 2"]
+    ) -> Float[Array, "n 3"]:
+        """Where particles at x are seen, that were at `before` in the frame before and slide along `tangents`."""
+        there = x + self.lag * (before - x) + tangents @ self.slip
+        return self.centre[None] + self.shift[None] + (there - self.centre[None]) @ self.turn.T
+
+
+class SheetModel(eqx.Module):
+    """Of one frame."""
+
+    energy: SheetEnergy
+    """Its `rest` are the anchors of the attachments."""
+    tool: Float[Array, " 3"]
+    """How far the jaws have taken what they hold since they closed [m]."""
+    view: View
+
+    def has(self, kind: type[Term]) -> bool:
+        """Whether the energy has a term of a kind: a sheet in the air has no bed."""
+        return any(isinstance(term, kind) for term in self.energy.terms)
+
+    def term(self, kind: type[Kind]) -> Kind:
+        """The energy's term of a kind."""
+        return next(term for term in self.energy.terms if isinstance(term, kind))
+
+    def with_term(self, new: Term) -> "SheetModel":
+        """With another term in the place of the one of its kind."""
+        terms = tuple(new if type(term) is type(new) else term for term in self.energy.terms)
+        return eqx.tree_at(lambda model: model.energy.terms, self, terms)
+
+
+class Moment(eqx.Module):
+    """What an effect may know of a frame."""
+
+    rest: Float[Array, "n 3"]
+    """[m]."""
+    time: Float[Array, ""]
+    """Since the sheet was seen at rest [s]."""
+    gap: Float[Array, ""]
+    """Since the frame before [s]."""
+    earlier_gap: Float[Array, ""]
+    """From the one before that to the frame before [s]."""
+    closed: Float[Array, ""]
+    """Since the jaws closed [s]."""
+    index: Float[Array, " frames"]
+    """1 at the frame's own place among all frames with closed jaws."""
+    now: Float[Array, "n 3"]
+    """The frame's own state, as far as it is known already [m]."""
+    before: Float[Array, "n 3"]
+    """State of the frame before; where the jaws have just closed, as it lay [m]."""
+    earlier: Float[Array, "n 3"]
+    """Of the one before that [m]."""
+    report_times: Float[Array, " reports"]
+    """When the tool's way was reported during this grasp [s], as `time`; beyond the last, it stood."""
+    reports: Float[Array, "reports 3"]
+    """The way since the jaws closed [m]."""
+    past: Float[Array, "frames n 3"]
+    """States of all frames with closed jaws [m]."""
+    began: Float[Array, " frames"]
+    """When the tissue went to each of these states [s]."""
+    ended: Float[Array, " frames"]
+    """When it was last there [s]."""
+
+    def faded(self, rate: Float[Array, ""]) -> Float[Array, " frames"]:
+        """What a memory that follows at a rate [1/s] holds of each state by now; it began at rest."""
+        until, since = (jnp.where(at <= self.time, jnp.exp(-rate * (self.time - at)), 0.0) for at in self._spans())
+        return until - since
+
+    def _spans(self) -> tuple[Float[Array, " frames"], Float[Array, " frames"]]:
+        return self.ended, jnp.where(self.ended <= self.time, self.began, jnp.inf)
+
+
+def undisturbed(mesh: SheetMesh, declaration: Declaration) -> SheetEnergy:
+    """The declared sheet's energy with all the terms that effects may need.
+
+    Raises:
+        ValueError: its membrane is not of triangles.
+    """
+    energy = surrogate(mesh, declaration)
+    terms: tuple[Term, ...] = energy.terms
+    if not any(isinstance(term, Weight) for term in terms):
+        terms = (*terms, Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=(0, 0, 0)))
+    terms = (*terms, *(kind.build(mesh.rest) for kind in (Rub, Load, Film, Tether)))
+    return SheetEnergy.build(mesh.rest, terms, Layout.from_pattern(mesh.adjacency, mesh.rest))
+
+
+def tangents(membrane: TriangleMembrane, x: Float[Array, "n 3"]) -> Float[Array, "n 3 2"]:
+    """Derivative of the position along the two material axes, at each particle the mean of its triangles'."""
+    F = jnp.einsum("fai,fak->fik", x[membrane.vertices], membrane.shape_gradient)
+    spread = jnp.broadcast_to((membrane.area[:, None, None] * F)[:, None], (*membrane.vertices.shape, 3, 2))
+    total = jnp.zeros((len(x), 3, 2), x.dtype).at[membrane.vertices].add(spread)
+    around = jnp.zeros(len(x), x.dtype).at[membrane.vertices].add(membrane.area[:, None])
+    return total / around[:, None, None]
+
+
+def centred(rest: Float[np.ndarray, "n 3"]) -> View:
+    """As it is."""
+    nothing = jnp.zeros(3)
+    return View(
+        centre=jnp.asarray(rest.mean(axis=0)), turn=jnp.eye(3), shift=nothing, lag=jnp.zeros(()), slip=jnp.zeros(2)
+    )

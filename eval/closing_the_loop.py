@@ -1,0 +1,103 @@
+"""Closes the loop over a recording: files in, `discrepancy.json` and a page of pictures out.
+
+The truth, where one is given, is opened when all is decided, and only adds what was found of the attachments before and
+after.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+from jiggle_mj.estimator import EstimatorConfig
+from jiggle_mj.estimator.attribution.closing import close_the_loop
+from jiggle_mj.estimator.attribution.discrepancy import discrepancy
+from jiggle_mj.estimator.attribution.gather import gather
+from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.effects import LIBRARY, Effect
+from jiggle_mj.eval.carrying import carry
+from jiggle_mj.eval.discrepancy_page import write_page
+from jiggle_mj.eval.metrics import DILATIONS, agreement
+
+from jiggle_mj.episode import check_directory, clear_directory
+from jiggle_mj.errors import RecordingError
+from jiggle_mj.estimate import Sheet
+from jiggle_mj.recording import Recording
+from jiggle_mj.truth import Truth
+from jiggle_mj.truth_recording import read_truth
+
+if TYPE_CHECKING:
+    from jiggle_mj.episode import OnFrame
+
+DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
+
+
+def close_loop(
+    recording_path: Path,
+    directory: Path,
+    *,
+    truth: Path | None = None,
+    library: tuple[Effect, ...] = LIBRARY,
+    overwrite: bool = False,
+    allow_truncated: bool = False,
+    on_frame: "OnFrame | None" = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Find what the model lacks of a recording, add it, and report the error before and after.
+
+    Args:
+        recording_path: the MCAP file.
+        directory: where discrepancy.json and discrepancy.html go.
+        truth: a truth file, to score what is found attached before and after; looked at when all is decided.
+        library: effects that are looked for; `(*LIBRARY, mine)` adds one.
+        overwrite: replace an earlier run's files.
+        allow_truncated: use what is whole of a recording that was cut off.
+        on_frame: called after each frame of the first estimate.
+        say: told what is being done.
+
+    Returns:
+        The content of discrepancy.json.
+
+    Raises:
+        JiggleError: what any of the parts raises.
+        ValueError: an effect of the library gives no finite derivative, or changes a shape.
+    """
+    recording = Recording.open(recording_path, allow_truncated=allow_truncated)
+    own = (DISCREPANCY, PAGE)
+    check_directory(directory, own, overwrite=overwrite)
+    clear_directory(directory, own)
+    observations = (_told(observation, on_frame) for observation in recording)
+    gathered = gather(recording.declaration, recording.camera, observations, config=EstimatorConfig())
+    with jax.enable_x64(True), one_thread():
+        closed = close_the_loop(gathered, library=library, say=say)
+        found = discrepancy(closed, gathered)
+    sheet = gathered.estimator.sheet
+    if truth is not None:
+        true = read_truth(truth)
+        if true.identity != recording.metadata.get("identity", ""):
+            raise RecordingError(f"{truth} is not the truth of {recording_path}.")
+        last = gathered.frames[-1].index
+        for when, stage in (("before", closed.stages[0]), ("after", closed.stages[-1])):
+            found[f"detection_{when}"] = _scored(sheet, stage.fitted.point.s > 0, true, last)
+    name = recording.metadata.get("name", recording_path.stem)
+    (directory / DISCREPANCY).write_text(json.dumps(found, indent=1) + "\n")
+    write_page(directory / PAGE, name=name, sheet=sheet, found=found)
+    return found
+
+
+def _told(observation, on_frame: "OnFrame | None"):
+    if on_frame is not None:
+        on_frame(observation, None)
+    return observation
+
+
+def _scored(sheet: Sheet, detected: Bool[np.ndarray, " n"], truth: Truth, index: int) -> dict[str, Any]:
+    attached = carry(sheet, truth, index).attached
+    return {
+        "n_detected": int(detected.sum()),
+        "n_attached": int(attached.sum()),
+        "by_dilation": {str(rings): vars(agreement(detected, attached, sheet.faces, rings)) for rings in DILATIONS},
+    }

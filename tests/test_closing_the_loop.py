@@ -1,0 +1,159 @@
+"""Closing the loop over lifts by our own engine: what is missing is named, and nothing where nothing is."""
+
+import dataclasses
+import json
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.attribution.closing import close_the_loop
+from jiggle_mj.estimator.attribution.discrepancy import discrepancy
+from jiggle_mj.estimator.attribution.gather import ASSUMED, gather
+from jiggle_mj.estimator.attribution.still_noise import measure
+from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.effects import LIBRARY
+from jiggle_mj.estimator.environment import Weight
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.eval.discrepancy_page import story, write_page
+from small_sheet import DECLARATION, GRIP_RADIUS, STIFFNESS, attached, lifts, sheet, sheet_balance, sheet_energy
+
+from jiggle_mj.estimate import Sheet
+from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
+
+NOISE = 1e-4
+STILL = 10
+SMALL = tuple(
+    effect for effect in LIBRARY if effect.name in ("gravity", "stretch", "bending", "friction", "tool_scale", "bed")
+)
+
+
+@cache
+def lifted(gravity: float) -> tuple[np.ndarray, ...]:
+    """States of the shared lifts under a share of the declared gravity, what is held following the tip rigidly."""
+    kinds = [type(term) for term in sheet_energy().terms]
+    energy = eqx.tree_at(
+        lambda e: e.terms[kinds.index(Weight)].gravity, sheet_energy(), replace_fn=lambda g: gravity * g
+    )
+    balance, k = sheet_balance(1e-4).of(energy), DECLARATION.membrane_stiffness
+    s, states = jnp.asarray(attached() * STIFFNESS / (STIFFNESS + k)), []
+    first = {lift.grasp: lift.tip for lift in lifts()[::-1]}
+    predict = eqx.filter_jit(balance.predict)
+    for lift, before in zip(lifts(), (None, *lifts()), strict=False):
+        start = sheet().rest if before is None or before.grasp != lift.grasp else states[-1]
+        held, to = jnp.asarray(lift.held), sheet().rest + lift.tip - first[lift.grasp]
+        precision = jnp.broadcast_to(1e6 * jnp.eye(3)[None], (len(s), 3, 3))
+        evidence = Evidence(y=jnp.asarray(to), precision=precision, held=held, loaded=held)
+        states.append(np.asarray(predict(jnp.asarray(np.where(lift.held[:, None], to, start)), s, evidence)))
+    return tuple(states)
+
+
+def seen(gravity: float, *, tool_scale: float = 1.0) -> list[Observation]:
+    """Still frames, then the lifts: tracked points with noise, and the tool as it says."""
+    frames = [(sheet().rest, np.array([0.0, 0.0, 0.05]), 0)] * STILL
+    frames += [(x, lift.tip, lift.grasp) for x, lift in zip(lifted(gravity), lifts(), strict=True)]
+    first = {grasp: tip for _, tip, grasp in frames[::-1]}
+    return [
+        Observation(
+            index=k,
+            time=k * 250_000_000,
+            tool=ToolState(
+                position=first[grasp] + (tip - first[grasp]) / tool_scale,
+                quat_wxyz=np.array([1.0, 0, 0, 0]),
+                closed=grasp > 0,
+                grasp=grasp,
+                radius=GRIP_RADIUS,
+            ),
+            points=MeasuredPoints(
+                positions=x + NOISE * np.random.default_rng(k).normal(size=x.shape),
+                track_id=np.arange(len(x)),
+                sd=NOISE,
+            ),
+        )
+        for k, (x, tip, grasp) in enumerate(frames)
+    ]
+
+
+def closed_over(observations: list[Observation]):
+    gathered = gather(DECLARATION, None, observations)
+    with jax.enable_x64(True), one_thread():
+        closed = close_the_loop(gathered, library=SMALL)
+        return closed, discrepancy(closed, gathered)
+
+
+@pytest.fixture(scope="module")
+def light():
+    """Gravity is a fifth of what is declared, which changes the lifted shape by more than the noise."""
+    return closed_over(seen(0.2))
+
+
+def test_an_undeclared_gravity_is_named_with_its_size_and_foretells_a_grasp_never_seen(light):
+    closed, found = light
+    assert [one["name"] for one in found["effects"]] == ["gravity"], story(found)
+    theta, sd = found["effects"][0]["theta"][2], found["effects"][0]["sd"][2]
+    assert abs(theta - 0.8) < 3 * max(sd, 0.05)
+    assert closed.reported is not None
+    before, after = (one.rms for one in closed.reported)
+    assert after < 0.7 * before
+    assert after < 3**0.5 * 2 * NOISE
+
+
+def test_nothing_is_named_where_nothing_is_missing():
+    _, found = closed_over(seen(1.0))
+    assert found["verdict"] == "no-effect", story(found)
+    assert not found["effects"]
+    assert found["held_out"]["before_rms_m"] == found["held_out"]["after_rms_m"] < 3**0.5 * 2 * NOISE
+
+
+def test_a_tool_that_goes_further_than_it_says_is_named():
+    _, found = closed_over(seen(1.0, tool_scale=1.1))
+    assert found["effects"][0]["name"] == "tool_scale", story(found)
+    assert found["effects"][0]["theta"][0] == pytest.approx(np.log(1.1), abs=0.02)
+    assert found["effects"][0]["this_session_alone"]
+
+
+def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
+    closed, found = light
+    assert json.loads(json.dumps(found)) == found
+    assert {"verdict", "effects", "ambiguous_with", "tested", "held_out", "localisation"} <= set(found)
+    goes_with = found["localisation"]["goes_with"]
+    assert goes_with["height"] is not None and abs(goes_with["height"]) <= 1
+    for name in ("a", "b"):
+        write_page(tmp_path / f"{name}.html", name="light", sheet=_sheet(closed), found=found)
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+    assert "Added: gravity" in (tmp_path / "a.html").read_text()
+
+
+def test_noise_is_measured_from_still_frames_with_its_smooth_part():
+    draw, rest = np.random.default_rng(0), sheet().rest
+    apart = np.sum((rest[:, None] - rest[None]) ** 2, axis=2)
+    root = np.linalg.cholesky(np.exp(-0.5 * apart / 0.012**2) + 1e-9 * np.eye(len(rest)))
+    smooth = 2e-4 * np.einsum("ij,tjk->tik", root, draw.normal(size=(40, len(rest), 3)))
+    noise = measure(rest[None] + smooth + 1e-4 * draw.normal(size=(40, len(rest), 3)), rest)
+    assert noise is not None
+    assert noise.sd == pytest.approx(1e-4, rel=0.25)
+    assert noise.smooth_sd == pytest.approx(2e-4, rel=0.25)
+    assert noise.length == pytest.approx(0.012, rel=0.25)
+    fields, white = noise.fields(rest)
+    total = np.sum(fields**2, axis=1) + white**2
+    assert total.mean() == pytest.approx(noise.sd**2 + noise.smooth_sd**2, rel=0.02)
+
+
+def test_without_still_frames_the_noise_is_assumed_and_said_to_be():
+    assert measure(np.zeros((2, 5, 3)), np.zeros((5, 3))) is None
+    observations = [one for one in seen(1.0) if one.tool.closed][:6]
+    rest = dataclasses.replace(observations[0], tool=dataclasses.replace(observations[0].tool, closed=False, grasp=0))
+    rest = dataclasses.replace(rest, points=seen(1.0)[0].points)
+    gathered = gather(DECLARATION, None, [rest, *observations])
+    assert gathered.noise == ASSUMED
+
+
+def _sheet(closed):
+    return Sheet(rest=np.asarray(closed.problem.history.rest), faces=sheet().faces)
+
+
+def test_attached_particles_stay_found(light):
+    closed, _ = light
+    assert np.sum((closed.stages[-1].fitted.point.s > 0) != attached()) <= 2

@@ -1,0 +1,157 @@
+"""Effects: nothing where their parameters are 0, derivatives that finite differences confirm, and closed forms."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jiggle_mj.estimator.effects import LIBRARY, Effect
+from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, centred, tangents, undisturbed
+from jiggle_mj.estimator.environment import Weight
+from jiggle_mj.estimator.membrane import TriangleMembrane
+from small_sheet import DECLARATION, lifts, sheet, sheet_energy
+
+STEP = 1e-4
+"""Of finite differences, in prior standard deviations."""
+ENOUGH = 2e-3
+"""Share of a derivative by which differences may miss it."""
+WAY = np.array([1e-3, 2e-3, 6e-3])
+EFFECTS = {effect.name: effect for effect in LIBRARY}
+
+
+@pytest.fixture(scope="module")
+def moment():
+    """The third frame of the first grasp."""
+    states = jnp.asarray(np.stack([one.x for one in lifts()[:4]]))
+    times = jnp.array([0.0, 0.5, 1.25, 2.0])
+    ways = jnp.asarray(np.outer([0.0, 1.0, 2.0, 3.0], WAY))
+    return Moment(
+        rest=jnp.asarray(sheet().rest),
+        time=times[2],
+        gap=times[2] - times[1],
+        earlier_gap=times[1] - times[0],
+        closed=times[2],
+        index=jnp.eye(4)[2],
+        now=states[2],
+        before=states[1],
+        earlier=states[0],
+        report_times=times,
+        reports=ways,
+        past=states,
+        began=jnp.array([0.0, 0.0, 0.5, 1.25]),
+        ended=times,
+    )
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return SheetModel(energy=undisturbed(sheet(), DECLARATION), tool=jnp.asarray(2 * WAY), view=centred(sheet().rest))
+
+
+def shown(effect: Effect, plain: SheetModel, moment: Moment):
+    """Forces at the frame's state, where it is seen, the tool's way and the anchors, in comparable units."""
+    x, membrane = moment.now, plain.term(TriangleMembrane)
+    force, length = 1e-4, 1e-4
+
+    @jax.jit
+    def all_of(theta):
+        model = effect.acts(plain, theta, moment)
+        seen = model.view(x, before=moment.before, tangents=tangents(membrane, x))
+        parts = (
+            model.energy.internal_gradient(x) / force,
+            seen / length,
+            model.tool / length,
+            model.energy.rest / length,
+        )
+        return jnp.concatenate([part.ravel() for part in parts])
+
+    return all_of
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_nothing_at_zero_and_derivatives_are_finite_differences(name, plain, moment):
+    effect = EFFECTS[name]
+    with jax.enable_x64(True):
+        all_of, sd = shown(effect, plain, moment), np.tile(effect.prior_sd, effect.sites)
+        zero = jnp.zeros(effect.size)
+        without = shown(dataclasses.replace(effect, acts=lambda model, theta, moment: model), plain, moment)(zero)
+        np.testing.assert_allclose(all_of(zero), without, rtol=0, atol=1e-9)
+        draw = np.random.default_rng(0)
+        for at in (np.zeros(effect.size), 0.3 * sd * draw.normal(size=effect.size)):
+            way = sd * draw.normal(size=effect.size)
+            _, derivative = jax.jvp(all_of, (jnp.asarray(at),), (jnp.asarray(way),))
+            difference = (all_of(at + STEP * way) - all_of(at - STEP * way)) / (2 * STEP)
+            scale = float(jnp.max(jnp.abs(derivative)))
+            np.testing.assert_allclose(derivative, difference, rtol=0, atol=ENOUGH * scale + 1e-9)
+            assert scale > 0 or (name in ("inertia", "friction") and not at.any()), "it does nothing at all"
+
+
+def test_the_energy_with_room_for_effects_is_the_declared_one(plain):
+    with jax.enable_x64(True):
+        x = jnp.asarray(lifts()[2].x)
+        declared, b = sheet_energy().gradient(x, jnp.zeros(len(x))), jnp.zeros(len(x))
+        np.testing.assert_allclose(plain.energy.gradient(x, b), declared, rtol=0, atol=1e-12)
+
+
+def test_gravity_and_drag_are_their_closed_forms(plain, moment):
+    with jax.enable_x64(True):
+        forces = lambda model: np.asarray(model.energy.internal_gradient(moment.now))  # noqa: E731
+        mass = np.asarray(plain.term(Weight).mass)
+        heavier = EFFECTS["gravity"].acts(plain, jnp.array([0.0, 0.0, -1.0]), moment)
+        np.testing.assert_allclose(
+            forces(heavier) - forces(plain), mass[:, None] * [[0, 0, 9.80665]], rtol=0, atol=1e-12
+        )
+        dragged = EFFECTS["viscous_drag"].acts(plain, jnp.array([1e-3]), moment)
+        speed = np.asarray((moment.now - moment.before) / moment.gap)
+        k = DECLARATION.membrane_stiffness
+        np.testing.assert_allclose(forces(dragged) - forces(plain), 1e-3 * k * speed, rtol=0, atol=1e-12)
+
+
+def test_friction_resists_the_way_along_the_bed_with_its_share_of_the_load(plain, moment):
+    with jax.enable_x64(True):
+        rest = jnp.asarray(sheet().rest)
+        lying = eqx.tree_at(lambda m: (m.now, m.before), moment, (rest, rest - jnp.array([[5e-3, 0.0, 0.0]])))
+        rubbed = EFFECTS["friction"].acts(plain, jnp.array([0.4]), lying)
+        force = np.asarray(rubbed.energy.internal_gradient(rest) - plain.energy.internal_gradient(rest))
+        weight = np.asarray(plain.term(Weight).mass) * 9.80665
+        np.testing.assert_allclose(force[:, 0], 0.4 * weight, rtol=1e-3)
+        np.testing.assert_allclose(force[:, 1:], 0, atol=1e-12)
+
+
+def test_turning_the_camera_is_a_rotation_about_the_middle(plain, moment):
+    with jax.enable_x64(True):
+        x, membrane = moment.now, plain.term(TriangleMembrane)
+        theta = jnp.array([1e-3, 0.0, 0.0, 0.0, 0.0, np.pi / 2])
+        view = EFFECTS["camera_bias"].acts(plain, theta, moment).view
+        seen = np.asarray(view(x, before=moment.before, tangents=tangents(membrane, x)))
+        middle = sheet().rest.mean(axis=0)
+        off = np.asarray(x) - middle
+        np.testing.assert_allclose(seen - middle, np.column_stack([1e-3 - off[:, 1], off[:, 0], off[:, 2]]), atol=1e-12)
+
+
+def test_a_late_report_is_where_the_tool_was(plain, moment):
+    with jax.enable_x64(True):
+        later = EFFECTS["tool_latency"].acts(plain, jnp.array([0.375]), moment)
+        np.testing.assert_allclose(later.tool, 2.5 * WAY, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"name": "a name"}, "letters, digits and underscores; got 'a name'"),
+        ({"units": ("m", "m")}, "one entry for each parameter; got 2 and 1"),
+        ({"prior_sd": (0.0,)}, "prior_sd must be above 0"),
+    ],
+)
+def test_a_users_effect_is_checked(changed, says):
+    given = {
+        "name": "mine",
+        "acts": lambda model, theta, moment: model,
+        "units": ("m",),
+        "prior_sd": (1.0,),
+        "source": "me",
+    }
+    with pytest.raises(ValueError, match=says):
+        Effect(**{**given, **changed})
