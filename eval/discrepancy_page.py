@@ -44,9 +44,7 @@ def story(found: Mapping[str, Any]) -> list[str]:
     held = found["held_out"]
     if held["folds"] and found["effects"]:
         before, after = (np.sqrt(np.mean([one[f"{when}_rms_m"] ** 2 for one in held["folds"]])) for when in TIMES)
-        told.append(
-            f"Grasps left out of the fit are foretold to {1e3 * before:.2f} mm before, {1e3 * after:.2f} after."
-        )
+        told.append(f"Parts left out of the fit are foretold to {1e3 * before:.2f} mm before, {1e3 * after:.2f} after.")
     if held["before_rms_m"] is None:
         told.append(
             "There is one grasp alone: nothing was held out, and effects that one grasp cannot tell apart stay so."
@@ -55,7 +53,7 @@ def story(found: Mapping[str, Any]) -> list[str]:
         numbers = f"{1e3 * held['before_rms_m']:.2f} mm"
         if found["effects"]:
             numbers += f" before, {1e3 * held['after_rms_m']:.2f} mm after"
-        told.append(f"The last grasp decided nothing; from what the tool says it is foretold to {numbers}.")
+        told.append(f"The last part decided nothing; from what the tool says it is foretold to {numbers}.")
     if not found["noise"]["still_frames"]:
         told.append(
             f"There are no still frames: noise of {1e3 * found['noise']['sd_m']:.2g} mm, and as much that neighbours "
@@ -100,7 +98,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
             "log Bayes factor of each effect, one linear step [nat]",
             "what the miss goes with (rank correlation), before and after",
             "miss of each fitted frame [mm]",
-            "grasps left out of the fit, then one that decided nothing [mm]",
+            "parts left out of the fit, then one that decided nothing [mm]",
         ),
         vertical_spacing=0.1,
     )

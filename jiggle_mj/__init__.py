@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from jiggle_mj.estimate import Sheet as Sheet
     from jiggle_mj.estimator import Estimator as Estimator
     from jiggle_mj.estimator import EstimatorConfig as EstimatorConfig
+    from jiggle_mj.eval.closing_the_loop import close_loop as close_loop
     from jiggle_mj.eval.experiment import run_estimator as run_estimator
     from jiggle_mj.eval.experiment import run_scene as run_scene
     from jiggle_mj.eval.score import score as score
@@ -100,6 +101,7 @@ __all__ = [
     "Wait",
     "WorkerProcesses",
     "__version__",
+    "close_loop",
     "import_folder",
     "load_scene",
     "programme",
@@ -127,6 +129,7 @@ _NAMES_OF = {
     ),
     "estimate": ("Belief", "Detection", "Estimate", "Sheet"),
     "estimator": ("Estimator", "EstimatorConfig"),
+    "eval.closing_the_loop": ("close_loop",),
     "eval.experiment": ("run_estimator", "run_scene"),
     "eval.score": ("score",),
     "importing": ("import_folder",),

@@ -13,8 +13,9 @@ from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.attribution.gather import ASSUMED, gather
 from jiggle_mj.estimator.attribution.still_noise import measure
+from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.blas import one_thread
-from jiggle_mj.estimator.effects import LIBRARY
+from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.estimator.environment import Weight
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.eval.discrepancy_page import story, write_page
@@ -124,6 +125,27 @@ def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
         write_page(tmp_path / f"{name}.html", name="light", sheet=_sheet(closed), found=found)
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
     assert "Added: gravity" in (tmp_path / "a.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("acts", "says"),
+    [
+        (lambda model, theta, moment: eqx.tree_at(lambda m: m.tool, model, model.tool[:2] + theta[0]), "same parts"),
+        (lambda model, theta, moment: eqx.tree_at(lambda m: m.tool, model, model.tool + theta[0] + 1.0), "do nothing"),
+        (
+            lambda model, theta, moment: eqx.tree_at(lambda m: m.tool, model, model.tool + jnp.sqrt(theta[0])),
+            "no finite derivative at 0 along the parameters .0.",
+        ),
+        (lambda model, theta, moment: model, "to first order"),
+        (lambda model, theta, moment: model.nothing, "failed: 'SheetModel' object has no attribute 'nothing'"),
+    ],
+)
+def test_an_effect_of_ones_own_is_tried_first(light, acts, says):
+    mine = Effect(name="mine", acts=acts, units=("m",), prior_sd=(1e-3,), source="me")
+    problem, _ = light[0].problem, light[1]
+    sheet_with = dataclasses.replace(problem.sheet, library=(mine,))
+    with jax.enable_x64(True), pytest.raises(ValueError, match=says):
+        check_effects(dataclasses.replace(problem, sheet=sheet_with))
 
 
 def test_noise_is_measured_from_still_frames_with_its_smooth_part():

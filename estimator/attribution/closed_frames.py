@@ -37,6 +37,8 @@ class Timed:
     frame: ClosedFrame
     index: int
     grasp: int
+    part: int
+    """What is left out of fits together: the grasp, or a third of the only one."""
     time: float
     """Since the sheet was seen at rest [s]."""
     closed: float

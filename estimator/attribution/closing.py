@@ -15,6 +15,7 @@ from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.attribution.scores import Score, occam, scores
+from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.effects import LIBRARY, Effect
 
 LOOKED_AT = 3
@@ -22,7 +23,9 @@ LOOKED_AT = 3
 ENTER = 5.0
 """Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
 LEAD = 3.0
-"""By how much it must lead the next to be named alone [nat]."""
+"""By how much it must lead the next to be named alone where nothing is left out [nat]."""
+COMPARED = 0.5
+"""Effects with this share of the best log Bayes factor or more are compared by what they foretell."""
 MOST = 3
 """Effects that are added at most."""
 ABSURD = 3.5
@@ -50,6 +53,11 @@ class Trial:
     folds: list[Foretold] | None = None
 
     @property
+    def missed(self) -> float:
+        """Root mean square error over all parts left out [m]; without any, the less the likelier."""
+        return Foretold.together(self.folds).rms if self.folds else -self.log_bayes_factor
+
+    @property
     def sensible(self) -> bool:
         """Whether its size is."""
         return bool(np.all(np.abs(self.theta) <= ABSURD * np.asarray(self.effect.prior_sd)))
@@ -62,7 +70,7 @@ class Stage:
     fitted: Fitted
     left: Leftover
     folds: list[Foretold]
-    """Each grasp that was fitted to, foretold by a fit without it; none if there are fewer than two."""
+    """Each part that was fitted to, foretold by a fit without it; none if there are fewer than two."""
     scores: list[Score]
 
 
@@ -79,7 +87,7 @@ class Closed:
     stages: list[Stage]
     """The first with what is declared alone."""
     reported: tuple[Foretold, Foretold] | None
-    """A grasp that decided nothing, foretold before and after; None if there was none to spare."""
+    """A part that decided nothing, foretold before and after; None if there was none to spare."""
     problem: Problem
 
 
@@ -97,30 +105,42 @@ def close_the_loop(
         gathered: what was seen.
         library: effects that the model may lack.
         say: told what is being done.
+
+    Raises:
+        ValueError: an effect that is not of the library cannot be used; see `check_effects`.
     """
     problem = Problem.build(gathered, library)
-    grasps = list(dict.fromkeys(one.grasp for one in gathered.frames))
-    spare = grasps[-1] if len(grasps) > 1 else None
-    used = set(grasps) - {spare}
-    say(f"fitting {len(problem.frames(used))} frames of {len(used)} grasps with what is declared")
+    check_effects(problem)
+    parts = list(dict.fromkeys(one.part for one in gathered.frames))
+    spare = parts[-1] if len(parts) > 1 else None
+    used = set(parts) - {spare}
+    say(f"fitting {len(problem.frames(used))} frames in {len(used)} parts with what is declared")
     stages, accepted, refused, rivals = [_declared(problem, gathered, used, say)], [], [], []
     while len(accepted) < MOST:
         trials = _trials(problem, stages[-1], accepted, used, say)
-        best = None
+        passed: list[Trial] = []
         for trial in trials:
+            if passed and trial.log_bayes_factor < COMPARED * passed[0].log_bayes_factor:
+                break
             judged = _judged(problem, trial, used)
             why = _against(judged, stages[-1])
             if why is None:
-                best = judged
-                break
-            refused.append((judged, why))
-            say(f"{trial.effect.name} refused: {why}")
-        if best is None:
+                passed.append(judged)
+            else:
+                refused.append((judged, why))
+                say(f"{trial.effect.name} refused: {why}")
+        if not passed:
             break
+        best = min(passed, key=lambda one: one.missed)
+        rivals = [one for one in passed if one is not best and _as_good(one, best)]
+        refused += [
+            (one, f"{best.effect.name} foretells better, to {1e3 * best.missed:.2f} mm against {1e3 * one.missed:.2f}")
+            for one in passed
+            if one is not best and one not in rivals
+        ]
         accepted.append(best)
         assert best.left is not None and best.folds is not None
         stages.append(Stage(fitted=best.fitted, left=best.left, folds=best.folds, scores=[]))
-        rivals = [one for one in trials if one.effect is not best.effect and abs(_versus(problem, best, one)) < LEAD]
         say(f"{best.effect.name} added")
     reported = None
     if spare is not None:
@@ -151,9 +171,9 @@ def _folds(problem: Problem, fitted: Fitted, used: set[int]) -> list[Foretold]:
     if len(used) < 2:
         return []
     parts = []
-    for grasp in sorted(used):
-        without = fit(problem, fitted.named, fitted.point, used - {grasp}, passes=FOLD_PASSES)
-        parts.append(foretell(problem, without, grasp))
+    for part in sorted(used):
+        without = fit(problem, fitted.named, fitted.point, used - {part}, passes=FOLD_PASSES)
+        parts.append(foretell(problem, without, part))
     return parts
 
 
@@ -169,14 +189,14 @@ def _trials(
     for one in trials:
         say(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
     trials = [one for one in trials if one.log_bayes_factor > ENTER]
-    wins = {one.effect.name: sum(_versus(problem, one, other) > 0 for other in trials) for one in trials}
-    return sorted(trials, key=lambda one: (not one.sensible, -wins[one.effect.name], -one.log_bayes_factor))
+    return sorted(trials, key=lambda one: (not one.sensible, -one.log_bayes_factor))
 
 
-def _versus(problem: Problem, one: Trial, other: Trial) -> float:
-    """Log Bayes factor of an effect against another, in the mean under the weights of both."""
-    volumes = [occam(problem, trial.fitted)[0] + np.log(trial.effect.sites) for trial in (one, other)]
-    return float(np.mean(gains_over(problem, one.fitted, other.fitted)) - volumes[0] + volumes[1])
+def _as_good(one: Trial, best: Trial) -> bool:
+    """Whether an effect foretells what was left out about as well as the best; its evidence, if nothing was."""
+    if best.folds:
+        return one.missed * BETTER <= best.missed
+    return best.log_bayes_factor - one.log_bayes_factor < LEAD
 
 
 def _judged(problem: Problem, trial: Trial, used: set[int]) -> Trial:
@@ -220,7 +240,7 @@ def _against(best: Trial, stage: Stage) -> str | None:
         better = sum(b.rms < a.rms for a, b in zip(stage.folds, best.folds, strict=True))
         if after > BETTER * before or 2 * better <= len(stage.folds):
             return (
-                f"grasps left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
+                f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
                 f"better in {better} of {len(stage.folds)}"
             )
     return None

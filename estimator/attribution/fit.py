@@ -65,13 +65,13 @@ def fit(
     problem: Problem,
     named: np.ndarray,
     point: Point,
-    grasps: set[int],
+    parts: set[int],
     *,
     passes: int = PASSES,
     say: Callable[[str], None] = lambda _: None,
 ) -> Fitted:
-    """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some grasps."""
-    now, step = _reckoned(problem, named, point, problem.frames(grasps))
+    """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some parts."""
+    now, step = _reckoned(problem, named, point, problem.frames(parts))
     for count in range(passes):
         better = _shortened(problem, now, step)
         if better is None:
@@ -79,7 +79,7 @@ def fit(
         trial, cost = better
         say(f"pass {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
         gained = now.cost - cost
-        now, step = _reckoned(problem, named, trial, problem.frames(grasps))
+        now, step = _reckoned(problem, named, trial, problem.frames(parts))
         if gained < 2 * GAIN:
             break
     return now
@@ -163,7 +163,7 @@ def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, 
 def cost_under(problem: Problem, weights: dict[int, Metric], glances: dict[int, Glance], point: Point) -> float:
     """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
     total, theta = 0.0, jnp.asarray(point.theta)
-    for frames in problem.by_grasp(glances).values():
+    for frames in problem.by_part(glances).values():
         missed = []
         for k in frames:
             moment, frame = problem.history.moment(k, point.states), problem.history.frames[k].frame

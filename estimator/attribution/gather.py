@@ -19,6 +19,9 @@ from jiggle_mj.observation import Declaration, MeasuredPoints, Observation
 ASSUMED = StillNoise(sd=2e-4, smooth_sd=2e-4, length=1.2e-2, frames=0)
 """Where there are too few still frames."""
 
+PARTS = 3
+"""Into which a single grasp is divided; the last is foretold and decides nothing."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Gathered:
@@ -64,7 +67,7 @@ def gather(
     estimator.release()
     noise = _noise_of(still, estimator) or ASSUMED
     frames = [_weighed(one, noise.fields(estimator.sheet.rest)[1]) for one in frames]
-    return Gathered(estimator=estimator, frames=frames, noise=noise, detection=estimator.detection)
+    return Gathered(estimator=estimator, frames=_parted(frames), noise=noise, detection=estimator.detection)
 
 
 def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, since: int, closed: int) -> Timed:
@@ -85,6 +88,7 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, s
         frame=frame,
         index=found.index,
         grasp=observation.tool.grasp,
+        part=observation.tool.grasp,
         time=(found.time - since) / 1e9,
         closed=(found.time - closed) / 1e9,
         state=found.positions,
@@ -97,6 +101,13 @@ def _weighed(one: Timed, sd: float) -> Timed:
         precision = jnp.where(one.frame.visible[:, None, None], jnp.eye(3)[None] / sd**2, 0.0)
     frame = ClosedFrame(**{**vars(one.frame), "precision": precision})
     return Timed(**{**vars(one), "frame": frame})
+
+
+def _parted(frames: list[Timed]) -> list[Timed]:
+    """A single grasp in `PARTS`, one after the other, if it is long enough."""
+    if len({one.grasp for one in frames}) > 1 or len(frames) < 2 * PARTS:
+        return frames
+    return [Timed(**{**vars(one), "part": 1 + PARTS * k // len(frames)}) for k, one in enumerate(frames)]
 
 
 def _noise_of(still: list[MeasuredPoints], estimator: Estimator) -> StillNoise | None:

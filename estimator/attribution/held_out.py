@@ -47,9 +47,9 @@ class Foretold:
         return Foretold(off=np.concatenate([one.off for one in parts]), sd=np.concatenate([one.sd for one in parts]))
 
 
-def foretell(problem: Problem, fitted: Fitted, grasp: int) -> Foretold:
-    """One grasp that was not fitted to."""
-    frames, point = problem.frames({grasp}), fitted.point
+def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
+    """One part that was not fitted to."""
+    frames, point = problem.frames({part}), fitted.point
     rest = np.asarray(problem.history.rest)
     states = np.where(np.isin(np.arange(len(point.states)), frames)[:, None, None], rest[None], point.states)
     seen = states

@@ -38,7 +38,7 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
         whole = sum(float(_log_determinant(one)) for one in weights.values())
         fields = [
             np.sum([np.asarray(glances[k].square)[-1 - N_FIELDS : -1, -1 - N_FIELDS : -1] for k in frames], axis=0)
-            for frames in problem.by_grasp(glances).values()
+            for frames in problem.by_part(glances).values()
         ]
         for ratio in AMPLITUDES:
             amplitude = ratio * problem.amplitude

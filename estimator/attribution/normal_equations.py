@@ -9,7 +9,7 @@ from jiggle_mj.estimator.attribution.problem import Problem
 def reduced(problem: Problem, glances: dict[int, Glance], d: int) -> Float[np.ndarray, "k k"]:
     """Over s, the first d directions and -1."""
     total: np.ndarray | float = 0.0
-    for frames in problem.by_grasp(glances).values():
+    for frames in problem.by_part(glances).values():
         whole = np.sum([np.asarray(glances[k].square) for k in frames], axis=0)
         rows = np.array([np.asarray(glances[k].tool) for k in frames])
         n = len(whole) - rows.shape[2]

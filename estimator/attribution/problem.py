@@ -65,16 +65,16 @@ class Problem:
         sheet = eqx.tree_at(lambda one: one.balance, self.sheet, self.sheet.balance.widened(variance))
         return Problem(**{**vars(self), "sheet": sheet, "amplitude": amplitude})
 
-    def frames(self, grasps: Iterable[int]) -> list[int]:
-        """Frames of some grasps."""
-        return [k for k, one in enumerate(self.history.frames) if one.grasp in set(grasps)]
+    def frames(self, parts: Iterable[int]) -> list[int]:
+        """Frames of some parts."""
+        return [k for k, one in enumerate(self.history.frames) if one.part in set(parts)]
 
-    def by_grasp(self, frames: Iterable[int]) -> dict[int, list[int]]:
-        """Frames sorted by grasp."""
-        by_grasp: dict[int, list[int]] = {}
+    def by_part(self, frames: Iterable[int]) -> dict[int, list[int]]:
+        """Frames sorted by part."""
+        by_part: dict[int, list[int]] = {}
         for k in frames:
-            by_grasp.setdefault(self.history.frames[k].grasp, []).append(k)
-        return by_grasp
+            by_part.setdefault(self.history.frames[k].part, []).append(k)
+        return by_part
 
     def free(self, named: np.ndarray) -> np.ndarray:
         """Named parameters, and the sheet's own."""
