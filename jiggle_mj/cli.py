@@ -32,6 +32,7 @@ Sensing = Literal["stereo", "points", "particles", "cloud"]
 FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
 PathArgument = Annotated[Path, tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
+TableName = Literal["main", "active", "acts", "undeclared", "scalability", "simulation", "one-lift"]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 AsJson = Annotated[bool, tyro.conf.arg(name="json")]
 Disturb = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[=MAGNITUDE]")]]
@@ -372,7 +373,7 @@ def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = N
 
 
 def table(
-    name: Annotated[Literal["main", "active", "acts", "scalability", "simulation", "one-lift"], tyro.conf.Positional],
+    name: Annotated[TableName, tyro.conf.Positional],
     /,
     *,
     out: Out,
@@ -384,12 +385,14 @@ def table(
 
     Args:
         name: main is the README's; active is the paper's comparison of policies, with ours; acts is whether failed cuts
-            and sutures are noticed; scalability times plans at three sizes, on this machine; simulation and one-lift
-            are the paper's, with its printed figures and all baselines.
+            and sutures are noticed; undeclared is whether close-loop names what nobody declares; scalability times
+            plans at three sizes, on this machine; simulation and one-lift are the paper's, with its printed figures and
+            all baselines.
         out: holds a folder for each run, and of active the curves, active.html.
-        seeds: of each row; 0 to 2 for main, 0 to 5 for acts and 0 to 9 for the paper's if left out.
+        seeds: of each row; 0 to 2 for main, 0 to 5 for acts, 0 to 4 for undeclared and 0 to 9 for the paper's if left
+            out.
         sensing: of active; particles if left out.
-        jobs: of active and acts: how many runs at a time; as many as there are usable cores if left out.
+        jobs: of active, acts and undeclared: how many runs at a time; as many as there are usable cores if left out.
     """
     from jiggle_mj.eval import paper_tables, tables
 
@@ -398,8 +401,8 @@ def table(
 
     if sensing is not None and name != "active":
         raise OptionError(f"--sensing is for the table active; got {name}.")
-    if jobs is not None and name not in ("active", "acts"):
-        raise OptionError(f"--jobs is for the tables active and acts; got {name}.")
+    if jobs is not None and name not in ("active", "acts", "undeclared"):
+        raise OptionError(f"--jobs is for the tables active, acts and undeclared; got {name}.")
     if name == "main":
         print(tables.markdown(tables.measure(tables.MAIN, seeds or range(3), out, say=say)))
     elif name == "active":
@@ -426,6 +429,14 @@ def table(
         with WorkerProcesses(jobs) as executor:
             found = acts_table.measure(acts_table.SCENES, seeds or range(6), out, executor=executor, say=say)
         print(acts_table.markdown(found))
+    elif name == "undeclared":
+        from jiggle_mj.eval import undeclared_table as undeclared
+        from jiggle_mj.worker_processes import WorkerProcesses
+
+        names = (*undeclared.INSIDE, *undeclared.OUTSIDE, undeclared.NOTHING)
+        with WorkerProcesses(jobs) as executor:
+            closed = undeclared.measure(names, seeds or range(5), out, executor=executor, say=say)
+        print(undeclared.markdown(closed))
     elif name == "scalability":
         from jiggle_mj.eval import scalability
 

@@ -24,6 +24,8 @@ ENTER = 5.0
 """Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
 LEAD = 3.0
 """By how much it must lead the next to be named alone where nothing is left out [nat]."""
+AS_GOOD = 0.9
+"""Share of its error from which an effect counts as no worse than the best."""
 COMPARED = 0.5
 """Effects with this share of the best log Bayes factor or more are compared by what they foretell."""
 MOST = 3
@@ -195,7 +197,7 @@ def _trials(
 def _as_good(one: Trial, best: Trial) -> bool:
     """Whether an effect foretells what was left out about as well as the best; its evidence, if nothing was."""
     if best.folds:
-        return one.missed * BETTER <= best.missed
+        return one.missed * AS_GOOD <= best.missed
     return best.log_bayes_factor - one.log_bayes_factor < LEAD
 
 
