@@ -1,7 +1,8 @@
 """Whether closing the loop names what a scene holds and nobody declares: effects of the library, none, and others.
 
-A sheet that is attached along an arc is lifted at four corners and one edge, and let down; particles are seen with noise
-half of which neighbours share. What would belong to the rest shape if it were there from the start begins after the still frames.
+A sheet that is attached along an arc is lifted at four corners and one edge, and let down; particles are seen with
+noise half of which neighbours share. What would belong to the rest shape if it were there from the start begins after
+the still frames.
 """
 
 import json
