@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
-from jiggle_mj.estimator.attribution.gather import ASSUMED, gather
+from jiggle_mj.estimator.attribution.gather import assumed, gather
 from jiggle_mj.estimator.attribution.still_noise import measure
 from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.blas import one_thread
@@ -169,7 +169,7 @@ def test_without_still_frames_the_noise_is_assumed_and_said_to_be():
     rest = dataclasses.replace(observations[0], tool=dataclasses.replace(observations[0].tool, closed=False, grasp=0))
     rest = dataclasses.replace(rest, points=seen(1.0)[0].points)
     gathered = gather(DECLARATION, None, [rest, *observations])
-    assert gathered.noise == ASSUMED
+    assert gathered.noise == assumed(NOISE)
 
 
 def _sheet(closed):

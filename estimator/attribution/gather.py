@@ -16,8 +16,8 @@ from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Detection, Estimate
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation
 
-ASSUMED = StillNoise(sd=2e-4, smooth_sd=2e-4, length=1.2e-2, frames=0)
-"""Where there are too few still frames."""
+ASSUMED_SD, ASSUMED_LENGTH = 2e-4, 1.2e-2
+"""White and smooth part of what is seen, each, and the range, where neither still frames nor the recording say [m]."""
 
 PARTS = 3
 """Into which a single grasp is divided; the last is foretold and decides nothing."""
@@ -47,11 +47,13 @@ def gather(
     Raises:
         PerceptionError: no frame with closed jaws could be used.
     """
-    estimator, frames, still = Estimator(declaration, camera, config=config), [], []
+    estimator, frames, still, stated = Estimator(declaration, camera, config=config), [], [], ASSUMED_SD
     began: int | None = None
     grasp, closed = -1, 0
     for observation in observations:
         found = estimator.update(observation)
+        if observation.points is not None:
+            stated = observation.points.sd
         if found is None:
             if not frames and observation.points is not None:
                 still.append(observation.points)
@@ -65,9 +67,14 @@ def gather(
     if not frames:
         raise PerceptionError("no frame with closed jaws could be used, so there is nothing to close the loop over.")
     estimator.release()
-    noise = _noise_of(still, estimator) or ASSUMED
+    noise = _noise_of(still, estimator) or assumed(stated)
     frames = [_weighed(one, noise.fields(estimator.sheet.rest)[1]) for one in frames]
     return Gathered(estimator=estimator, frames=_parted(frames), noise=noise, detection=estimator.detection)
+
+
+def assumed(sd: float) -> StillNoise:
+    """Where there are too few still frames: what is stated of each point, and as much that neighbours share."""
+    return StillNoise(sd=sd, smooth_sd=sd, length=ASSUMED_LENGTH, frames=0)
 
 
 def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, since: int, closed: int) -> Timed:
@@ -105,7 +112,7 @@ def _weighed(one: Timed, sd: float) -> Timed:
 
 def _parted(frames: list[Timed]) -> list[Timed]:
     """A single grasp in `PARTS`, one after the other, if it is long enough."""
-    if len({one.grasp for one in frames}) > 1 or len(frames) < 2 * PARTS:
+    if len({one.grasp for one in frames}) > 1 or len(frames) <= PARTS:
         return frames
     return [Timed(**{**vars(one), "part": 1 + PARTS * k // len(frames)}) for k, one in enumerate(frames)]
 
