@@ -24,6 +24,8 @@ ENTER = 5.0
 """Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
 LEAD = 3.0
 """By how much it must lead the next to be named alone where nothing is left out [nat]."""
+DECISIVE = 0.8
+"""The same, from which it need not beat larger errors without a cause."""
 AS_GOOD = 0.9
 """Share of its error from which an effect counts as no worse than the best."""
 COMPARED = 0.5
@@ -235,16 +237,15 @@ def _against(best: Trial, stage: Stage) -> str | None:
     assert best.left is not None and best.folds is not None
     if not best.sensible:
         return f"its size is beyond {ABSURD:g} prior standard deviations"
-    if best.log_bayes_factor + best.left.gain < stage.left.gain + ENTER:
+    before, after = (Foretold.together(parts).rms if parts else 1.0 for parts in (stage.folds, best.folds))
+    if after > DECISIVE * before and best.log_bayes_factor + best.left.gain < stage.left.gain + ENTER:
         return "larger errors without a cause explain the frames as well"
-    if stage.folds:
-        before, after = (Foretold.together(parts).rms for parts in (stage.folds, best.folds))
-        better = sum(b.rms < a.rms for a, b in zip(stage.folds, best.folds, strict=True))
-        if after > BETTER * before or 2 * better <= len(stage.folds):
-            return (
-                f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
-                f"better in {better} of {len(stage.folds)}"
-            )
+    better = sum(b.rms < a.rms for a, b in zip(stage.folds, best.folds, strict=True))
+    if stage.folds and (after > BETTER * before or 2 * better <= len(stage.folds)):
+        return (
+            f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
+            f"better in {better} of {len(stage.folds)}"
+        )
     return None
 
 
