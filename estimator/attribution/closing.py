@@ -20,7 +20,7 @@ from jiggle_mj.estimator.effects import LIBRARY, Effect
 
 LOOKED_AT = 3
 """Effects that are fitted, the likeliest by their scores."""
-ENTER = 5.0
+ENTER = 10.0
 """Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
 LEAD = 3.0
 """By how much it must lead the next to be named alone where nothing is left out [nat]."""
@@ -86,7 +86,7 @@ class Closed:
     """One of `VERDICTS`."""
     accepted: list[Trial]
     rivals: list[Trial]
-    """Effects that the last one accepted could not be told from."""
+    """Effects that one of those accepted could not be told from."""
     refused: list[tuple[Trial, str]]
     stages: list[Stage]
     """The first with what is declared alone."""
@@ -98,6 +98,8 @@ class Closed:
 VERDICTS = ("no-effect", "effect", "ambiguous", "effect-with-remainder", "unexplained")
 REMAINDER = 60.0
 """What larger errors without a cause may gain before something is said to be left over [nat]."""
+EXCESS = 5.0
+"""The same, by how many times the stated variance parts left out may be missed."""
 
 
 def close_the_loop(
@@ -136,13 +138,14 @@ def close_the_loop(
         if not passed:
             break
         best = min(passed, key=lambda one: one.missed)
-        rivals = [one for one in passed if one is not best and _as_good(one, best)]
+        close = [one for one in passed if one is not best and _not_told_from(one, best)]
         refused += [
             (one, f"{best.effect.name} foretells better, to {1e3 * best.missed:.2f} mm against {1e3 * one.missed:.2f}")
             for one in passed
-            if one is not best and one not in rivals
+            if one is not best and one not in close
         ]
         accepted.append(best)
+        rivals += close
         assert best.left is not None and best.folds is not None
         stages.append(Stage(fitted=best.fitted, left=best.left, folds=best.folds, scores=[]))
         say(f"{best.effect.name} added")
@@ -196,8 +199,13 @@ def _trials(
     return sorted(trials, key=lambda one: (not one.sensible, -one.log_bayes_factor))
 
 
-def _as_good(one: Trial, best: Trial) -> bool:
-    """Whether an effect foretells what was left out about as well as the best; its evidence, if nothing was."""
+def _not_told_from(one: Trial, best: Trial) -> bool:
+    """Whether an effect foretells what was left out about as well as the best, or is often confused with it.
+
+    Only those that explain at least half as much as the likeliest are asked. Where nothing was left out, evidence says.
+    """
+    if one.effect.name in best.effect.confounded_with and best.effect.name in one.effect.confounded_with:
+        return True
     if best.folds:
         return one.missed * AS_GOOD <= best.missed
     return best.log_bayes_factor - one.log_bayes_factor < LEAD
@@ -250,7 +258,8 @@ def _against(best: Trial, stage: Stage) -> str | None:
 
 
 def _verdict(accepted: list[Trial], rivals: list[Trial], stages: list[Stage], refused: list[tuple[Trial, str]]) -> str:
-    left_over = stages[-1].left.gain > REMAINDER
+    last = stages[-1]
+    left_over = last.left.gain > REMAINDER or (bool(last.folds) and Foretold.together(last.folds).excess > EXCESS)
     if not accepted:
         return "unexplained" if left_over else "no-effect"
     if left_over:

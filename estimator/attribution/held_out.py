@@ -32,6 +32,11 @@ class Foretold:
         return float(np.sqrt(np.mean(np.sum(self.off**2, axis=1))))
 
     @property
+    def excess(self) -> float:
+        """Mean square of the error in standard deviations: 1 where the fit knows how well it foretells."""
+        return float(np.mean((self.off / self.sd) ** 2))
+
+    @property
     def nll(self) -> float:
         """Mean negative log likelihood of a coordinate [nat, lengths in m]."""
         return float(np.mean(0.5 * (self.off / self.sd) ** 2 + np.log(self.sd) + 0.5 * np.log(2 * np.pi)))

@@ -23,7 +23,7 @@ def _tool_scale(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) ->
 
 
 def _tool_latency(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
-    """What is reported now is where the tool was theta ago: it has gone on as it went; less far if theta is negative."""
+    """What is reported now is where the tool was theta ago; since, it has gone on as it went."""
 
     def at(time: Array) -> Array:
         """The reported way; on the side of the past where two steps meet."""
