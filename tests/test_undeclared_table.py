@@ -70,10 +70,9 @@ def test_what_is_there_is_not_run_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(undeclared_table, "_run", run)
     with ThreadPoolExecutor(1) as executor:
-        for _ in range(2):
-            runs = measure(["tool scale"], [0, 1], tmp_path, executor=executor, say=lambda _: None)
+        runs = [measure(["tool scale"], [0, 1], tmp_path, executor=executor, say=lambda _: None) for _ in range(2)]
     assert ran == [("tool scale", 0), ("tool scale", 1)]
-    assert list(runs) == ran
+    assert [list(one) for one in runs] == [ran, ran]
 
 
 @pytest.mark.slow

@@ -8,8 +8,6 @@ from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel
 
 SMALL_ANGLE = 1e-3
 """[rad]."""
-INSTANT = 1e-9
-"""[s]."""
 
 
 def _tool_bias(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
@@ -23,15 +21,13 @@ def _tool_scale(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) ->
 
 
 def _tool_latency(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
-    """What is reported now is where the tool was theta ago; since, it has gone on as it went."""
+    """What is reported now is where the tool was theta ago; where the jaws close, what they hold has gone nowhere."""
 
     def at(time: Array) -> Array:
-        """The reported way; on the side of the past where two steps meet."""
-        return jnp.stack([jnp.interp(time - INSTANT, moment.report_times, moment.reports[:, k]) for k in range(3)])
+        return jnp.stack([jnp.interp(time, moment.report_times, moment.reports[:, k]) for k in range(3)])
 
-    now, late = at(moment.time), theta[0]
-    gone_on = jnp.where(late >= 0, now - at(moment.time - late), at(moment.time + late) - now)
-    return _taken(model, model.tool + gone_on)
+    further = at(moment.time + theta[0]) - at(moment.time)
+    return _taken(model, model.tool + jnp.where(moment.closed > 0, further, 0.0))
 
 
 def _image_latency(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
