@@ -7,7 +7,7 @@ after.
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,17 +20,14 @@ from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.eval.carrying import carry
 from jiggle_mj.eval.discrepancy_page import write_page
-from jiggle_mj.eval.metrics import DILATIONS, agreement
+from jiggle_mj.eval.score import Json, agreements
 
-from jiggle_mj.episode import check_directory, clear_directory
+from jiggle_mj.episode import OnFrame, check_directory, clear_directory
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.recording import Recording
 from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import read_truth
-
-if TYPE_CHECKING:
-    from jiggle_mj.episode import OnFrame
 
 DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
 
@@ -43,7 +40,7 @@ def close_loop(
     library: tuple[Effect, ...] = LIBRARY,
     overwrite: bool = False,
     allow_truncated: bool = False,
-    on_frame: "OnFrame | None" = None,
+    on_frame: OnFrame = lambda observation, found: None,
     say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Find what the model lacks of a recording, add it, and report the error before and after.
@@ -69,8 +66,7 @@ def close_loop(
     own = (DISCREPANCY, PAGE)
     check_directory(directory, own, overwrite=overwrite)
     clear_directory(directory, own)
-    observations = (_told(observation, on_frame) for observation in recording)
-    gathered = gather(recording.declaration, recording.camera, observations, config=EstimatorConfig())
+    gathered = gather(recording.declaration, recording.camera, recording, config=EstimatorConfig(), on_frame=on_frame)
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(gathered, library=library, say=say)
         found = discrepancy(closed, gathered)
@@ -88,16 +84,10 @@ def close_loop(
     return found
 
 
-def _told(observation, on_frame: "OnFrame | None"):
-    if on_frame is not None:
-        on_frame(observation, None)
-    return observation
-
-
-def _scored(sheet: Sheet, detected: Bool[np.ndarray, " n"], truth: Truth, index: int) -> dict[str, Any]:
-    attached = carry(sheet, truth, index).attached
+def _scored(sheet: Sheet, detected: Bool[np.ndarray, " n"], truth: Truth, index: int) -> Json:
+    carried = carry(sheet, truth, index)
     return {
         "n_detected": int(detected.sum()),
-        "n_attached": int(attached.sum()),
-        "by_dilation": {str(rings): vars(agreement(detected, attached, sheet.faces, rings)) for rings in DILATIONS},
+        "n_attached": int(carried.attached.sum()),
+        "by_dilation": agreements(sheet, detected, carried),
     }

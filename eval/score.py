@@ -144,14 +144,14 @@ def with_truth(
     _section(scored, "detection").update(
         n_detected=int(detection.attached.sum()),
         n_attached=int(carried.attached.sum()),
-        by_dilation=_agreements(sheet, detection, carried),
+        by_dilation=agreements(sheet, detection.attached, carried),
         average_precision=average_precision(detection.score, carried.attached),
     )
     observable = carried.observable
     if observable is not None:
         _section(scored, "detection").update(
             n_observable=int(observable.sum()),
-            observable={"by_dilation": _agreements(sheet, detection, carried, knowable=observable)},
+            observable={"by_dilation": agreements(sheet, detection.attached, carried, knowable=observable)},
         )
     _section(scored, "calibration").update(vars(judged))
     _section(scored, "tracking").update(rms_m=tracking(sheet, estimates, truth).rms)
@@ -240,13 +240,17 @@ def read_result(path: Path) -> Json:
     return figures
 
 
-def _agreements(
-    sheet: Sheet, detection: Detection, carried: CarriedTruth, *, knowable: Bool[np.ndarray, " n"] | None = None
+def agreements(
+    sheet: Sheet,
+    detected: Bool[np.ndarray, " n"],
+    carried: CarriedTruth,
+    *,
+    knowable: Bool[np.ndarray, " n"] | None = None,
 ) -> Json:
     """PCD, PUG and F1 by rings of dilation."""
     by_dilation: Json = {}
     for rings in DILATIONS:
-        one = agreement(detection.attached, carried.attached, sheet.faces, rings, knowable=knowable)
+        one = agreement(detected, carried.attached, sheet.faces, rings, knowable=knowable)
         by_dilation[str(rings)] = {"pcd": one.pcd, "pug": one.pug, "f1": one.f1}
     return by_dilation
 

@@ -33,7 +33,6 @@ def moment():
         gap=times[2] - times[1],
         earlier_gap=times[1] - times[0],
         closed=times[2],
-        index=jnp.eye(4)[2],
         now=states[2],
         before=states[1],
         earlier=states[0],

@@ -72,7 +72,6 @@ class History:
             gap=jnp.asarray(self._times[k] - self._times[k - 1] if follows[k] else USUAL_GAP),
             earlier_gap=jnp.asarray(self._times[k - 1] - self._times[k - 2] if twice else USUAL_GAP),
             closed=jnp.asarray(one.closed),
-            index=jnp.asarray(np.eye(len(self.frames))[k]),
             now=jnp.asarray(states[k]),
             before=jnp.asarray(before),
             earlier=jnp.asarray(states[k - 2] if twice else before),

@@ -1,13 +1,14 @@
 """Closing the loop: which effect the model lacks, added if frames that it never saw are foretold better with it.
 
-Fit with what is declared, score every effect at what is left, fit again with each of the likeliest from the start, take
-the one that explains most; keep it if it beats larger errors without a cause, if its size makes sense and if each
-grasp, left out of the fit, is foretold better. Again for a second and a third.
+Fit with what is declared, score every effect at what is left, fit again with each of the likeliest; of those that beat
+larger errors without a cause, make sense by their size and foretell what is left out of the fit better, keep the one
+that foretells it best. Again for a second and a third.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
 import numpy as np
 from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, cost_under, fit, gains_over, start
 from jiggle_mj.estimator.attribution.gather import Gathered
@@ -24,8 +25,6 @@ ENTER = 10.0
 """Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
 LEAD = 3.0
 """By how much it must lead the next to be named alone where nothing is left out [nat]."""
-DECISIVE = 0.8
-"""The same, from which it need not beat larger errors without a cause."""
 AS_GOOD = 0.9
 """Share of its error from which an effect counts as no worse than the best."""
 COMPARED = 0.5
@@ -36,8 +35,9 @@ ABSURD = 3.5
 """Prior standard deviations beyond which a parameter makes no sense."""
 FOLD_PASSES = 2
 """Gauss-Newton steps where one grasp is left out of a fit that has found its end."""
-BETTER = 0.97
-"""Share of the error over all grasps left out that an effect must bring it to."""
+BETTER, DECISIVE = 0.97, 0.8
+"""Shares of the error over all parts left out that an effect must bring it to, and from which on it need not beat
+larger errors without a cause."""
 START = 2.0
 """Prior standard deviations within which a fit begins."""
 
@@ -83,7 +83,7 @@ class Closed:
     """What came of it."""
 
     verdict: str
-    """One of `VERDICTS`."""
+    """no-effect, effect, ambiguous, effect-with-remainder or unexplained."""
     accepted: list[Trial]
     rivals: list[Trial]
     """Effects that one of those accepted could not be told from."""
@@ -95,7 +95,6 @@ class Closed:
     problem: Problem
 
 
-VERDICTS = ("no-effect", "effect", "ambiguous", "effect-with-remainder", "unexplained")
 REMAINDER = 60.0
 """What larger errors without a cause may gain before something is said to be left over [nat]."""
 EXCESS = 5.0
@@ -151,9 +150,10 @@ def close_the_loop(
         say(f"{best.effect.name} added")
     reported = None
     if spare is not None:
-        reported = foretell(problem, stages[0].fitted, spare), foretell(problem, stages[-1].fitted, spare)
+        before = foretell(problem, stages[0].fitted, spare)
+        reported = before, foretell(problem, stages[-1].fitted, spare) if accepted else before
     return Closed(
-        verdict=_verdict(accepted, rivals, stages, refused),
+        verdict=_verdict(accepted, rivals, stages[-1]),
         accepted=accepted,
         rivals=rivals,
         refused=refused,
@@ -165,9 +165,9 @@ def close_the_loop(
 
 def _declared(problem: Problem, gathered: Gathered, used: set[int], say: Callable[[str], None]) -> Stage:
     """The fit with no effect, from what the filter says."""
-    found, reference = gathered.detection, float(problem.sheet.balance.reference)
-    b = np.where(found.attached, found.stiffness, 0.0)
-    s = np.where(np.isinf(b), STIFFEST, np.minimum(b / (b + reference), STIFFEST))
+    found = gathered.detection
+    b = jnp.asarray(np.where(found.attached, found.stiffness, 0.0))
+    s = np.minimum(np.asarray(problem.prior.bounded(b)), STIFFEST)
     states = np.array([one.state for one in gathered.frames])
     point = start(problem, np.zeros(problem.sheet.size), s, states, problem.frames(used))
     fitted = fit(problem, np.zeros(0, dtype=int), point, used, say=say)
@@ -213,8 +213,7 @@ def _not_told_from(one: Trial, best: Trial) -> bool:
 
 def _judged(problem: Problem, trial: Trial, used: set[int]) -> Trial:
     """With what it leaves over and how it foretells."""
-    judged = {"left": leftover(problem, trial.fitted), "folds": _folds(problem, trial.fitted, used)}
-    return Trial(**{**vars(trial), **judged})
+    return replace(trial, left=leftover(problem, trial.fitted), folds=_folds(problem, trial.fitted, used))
 
 
 def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial], used: set[int]) -> Trial:
@@ -257,8 +256,7 @@ def _against(best: Trial, stage: Stage) -> str | None:
     return None
 
 
-def _verdict(accepted: list[Trial], rivals: list[Trial], stages: list[Stage], refused: list[tuple[Trial, str]]) -> str:
-    last = stages[-1]
+def _verdict(accepted: list[Trial], rivals: list[Trial], last: Stage) -> str:
     left_over = last.left.gain > REMAINDER or (bool(last.folds) and Foretold.together(last.folds).excess > EXCESS)
     if not accepted:
         return "unexplained" if left_over else "no-effect"

@@ -11,7 +11,7 @@ from jiggle_mj.estimator.attribution.localisation import localisation
 def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
     """Numbers, strings and lists alone; lengths in metres, log Bayes factors in nat."""
     first, last = closed.stages[0], closed.stages[-1]
-    noise = gathered.noise
+    noise, before = gathered.noise, localisation(closed.problem, first.fitted)
     return {
         "verdict": closed.verdict,
         "effects": [_effect(closed, one) for one in closed.accepted],
@@ -44,8 +44,8 @@ def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
             "smooth_length_m": noise.length,
             "still_frames": noise.frames,
         },
-        "localisation": localisation(closed.problem, first.fitted),
-        "localisation_after": localisation(closed.problem, last.fitted),
+        "localisation": before,
+        "localisation_after": localisation(closed.problem, last.fitted) if closed.accepted else before,
         "detection_before": None,
         "detection_after": None,
     }

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, glance, misfit
-from jiggle_mj.estimator.attribution.normal_equations import less_offset, reduced
+from jiggle_mj.estimator.attribution.normal_equations import among_fields, less_offset, reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
 from jiggle_mj.estimator.filters.implicit import reconsidered
@@ -149,15 +149,12 @@ def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, 
 
     Weights of different fits forgive different things, so that gains under one fit's alone do not compare.
     """
-    gains = []
-    for judge in (better, plain):
-        costs = [
-            cost_under(problem, judge.weights, judge.glances, one.point)
-            + _prior(one.point, one.free, problem.sd(one.named))
-            for one in (plain, better)
-        ]
-        gains.append((costs[0] - costs[1]) / 2)
-    return gains[0], gains[1]
+
+    def judged(judge: Fitted, one: Fitted) -> float:
+        misfit = cost_under(problem, judge.weights, judge.glances, one.point)
+        return misfit + _prior(one.point, one.free, problem.sd(one.named))
+
+    return (judged(better, plain) - better.cost) / 2, (plain.cost - judged(plain, better)) / 2
 
 
 def cost_under(problem: Problem, weights: dict[int, Metric], glances: dict[int, Glance], point: Point) -> float:
@@ -170,7 +167,7 @@ def cost_under(problem: Problem, weights: dict[int, Metric], glances: dict[int, 
             missed.append(misfit(problem.sheet, weights[k], theta, frame, moment, jnp.asarray(point.states[k])))
         tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
         fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
-        middle = np.sum([np.asarray(glances[k].square)[-1 - N_FIELDS : -1, -1 - N_FIELDS : -1] for k in frames], axis=0)
+        middle = np.sum([among_fields(np.asarray(glances[k].square)) for k in frames], axis=0)
         middle += np.eye(N_FIELDS) / problem.amplitude**2
         total += sum(float(one.squared) for one in missed) + less_offset(tool, tool)[0, 0]
         total -= fields @ np.linalg.solve(middle, fields)

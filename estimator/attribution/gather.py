@@ -1,11 +1,12 @@
 """A recording's frames with closed jaws, as the estimator saw them while it followed the recording."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, Timed
 from jiggle_mj.estimator.attribution.still_noise import StillNoise, measure
 from jiggle_mj.estimator.config import EstimatorConfig
@@ -30,6 +31,8 @@ class Gathered:
     estimator: Estimator
     frames: list[Timed]
     noise: StillNoise
+    fields: Float[np.ndarray, "n modes"]
+    """Of the noise's smooth part; the frames' precisions hold the rest [m]."""
     detection: Detection
     """With nothing but what is declared."""
 
@@ -40,7 +43,7 @@ def gather(
     observations: Iterable[Observation],
     *,
     config: EstimatorConfig | None = None,
-    on_frame: Callable[[Estimate], None] = lambda _: None,
+    on_frame: Callable[[Observation, Estimate | None], None] = lambda observation, found: None,
 ) -> Gathered:
     """Follow a recording.
 
@@ -52,6 +55,7 @@ def gather(
     grasp, closed = -1, 0
     for observation in observations:
         found = estimator.update(observation)
+        on_frame(observation, found)
         if observation.points is not None:
             stated = observation.points.sd
         if found is None:
@@ -63,13 +67,18 @@ def gather(
             grasp, closed = observation.tool.grasp, observation.time
         began = observation.time if began is None else began
         frames.append(_timed(estimator, observation, found, since=began, closed=closed))
-        on_frame(found)
     if not frames:
         raise PerceptionError("no frame with closed jaws could be used, so there is nothing to close the loop over.")
     estimator.release()
     noise = _noise_of(still, estimator) or assumed(stated)
-    frames = [_weighed(one, noise.fields(estimator.sheet.rest)[1]) for one in frames]
-    return Gathered(estimator=estimator, frames=_parted(frames), noise=noise, detection=estimator.detection)
+    fields, sd = noise.fields(estimator.sheet.rest)
+    return Gathered(
+        estimator=estimator,
+        frames=_parted([_weighed(one, sd) for one in frames]),
+        noise=noise,
+        fields=fields,
+        detection=estimator.detection,
+    )
 
 
 def assumed(sd: float) -> StillNoise:
@@ -106,15 +115,14 @@ def _weighed(one: Timed, sd: float) -> Timed:
     """With the white noise's precision on what is seen."""
     with jax.enable_x64(True):
         precision = jnp.where(one.frame.visible[:, None, None], jnp.eye(3)[None] / sd**2, 0.0)
-    frame = ClosedFrame(**{**vars(one.frame), "precision": precision})
-    return Timed(**{**vars(one), "frame": frame})
+    return replace(one, frame=replace(one.frame, precision=precision))
 
 
 def _parted(frames: list[Timed]) -> list[Timed]:
     """A single grasp in `PARTS`, one after the other, if it is long enough."""
     if len({one.grasp for one in frames}) > 1 or len(frames) <= PARTS:
         return frames
-    return [Timed(**{**vars(one), "part": 1 + PARTS * k // len(frames)}) for k, one in enumerate(frames)]
+    return [replace(one, part=1 + PARTS * k // len(frames)) for k, one in enumerate(frames)]
 
 
 def _noise_of(still: list[MeasuredPoints], estimator: Estimator) -> StillNoise | None:

@@ -1,12 +1,13 @@
 """How well frames are foretold that a fit never saw, from what the tool says alone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
-from jiggle_mj.estimator.attribution.fit import DIRECTIONS, Fitted, directions
-from jiggle_mj.estimator.attribution.linear import glance
+from jaxtyping import Array, Float
+from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
+from jiggle_mj.estimator.attribution.fit import DIRECTIONS, Fitted, directions, linearised
+from jiggle_mj.estimator.attribution.linear import Metric
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
 from scipy.stats import norm
@@ -62,24 +63,32 @@ def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
         states, seen = predict_all(
             problem.sheet, point.theta, point.s, problem.history, states, only=frames, by_tool=True
         )
-    off, sd = [], []
+    _, weights = linearised(
+        problem, replace(point, states=states), frames, directions(problem, fitted.free, DIRECTIONS)
+    )
+    known, off, sd = _covariance(problem, fitted), [], []
     for k in frames:
         frame = problem.history.frames[k].frame
         counted = np.asarray(frame.visible & ~frame.held)
         off.append((np.asarray(frame.y) - seen[k])[counted])
-        sd.append(_sd(problem, fitted, states, k)[counted])
+        sd.append(_sd(problem, weights[k], frame, known, jnp.asarray(states[k]))[counted])
     return Foretold(off=np.concatenate(off), sd=np.concatenate(sd))
 
 
-def _sd(problem: Problem, fitted: Fitted, states: np.ndarray, k: int) -> Float[np.ndarray, "n 3"]:
-    """Of what is seen of each particle: the noise, the forces that the model gets wrong, s and the parameters."""
-    point, one = fitted.point, problem.history.frames[k]
-    arguments = (jnp.asarray(point.theta), jnp.asarray(directions(problem, fitted.free, DIRECTIONS)))
-    moment, x = problem.history.moment(k, states), jnp.asarray(states[k])
-    _, metric = glance(
-        problem.sheet, *arguments, jnp.asarray(point.s), one.frame, moment, x, jnp.asarray(problem.noise)
-    )
-    n, frame, held = len(point.s), metric.frame, np.asarray(one.frame.held)
+def _covariance(problem: Problem, fitted: Fitted) -> Float[np.ndarray, "n n"]:
+    """Of a fit's s."""
+    n, d = len(fitted.site_precision), len(fitted.free)
+    precision = fitted.square[:-1, :-1].copy()
+    precision[np.arange(n), np.arange(n)] += fitted.site_precision
+    precision[np.arange(n, n + d), np.arange(n, n + d)] += problem.sd(fitted.named) ** -2
+    return np.linalg.inv(precision)[:n, :n]
+
+
+def _sd(
+    problem: Problem, metric: Metric, seen: ClosedFrame, known: Float[np.ndarray, "n n"], x: Float[Array, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Of what is seen of each particle: the noise, the forces that the model gets wrong, and s."""
+    n, frame, held = len(x), metric.frame, np.asarray(seen.held)
     rows = np.zeros((n + 1, 3, n + 1, 3))
     neighbours = np.asarray(metric.balance.neighbours)
     rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(np.asarray(frame.rows), 2, 3).swapaxes(2, 3)
@@ -91,12 +100,7 @@ def _sd(problem: Problem, fitted: Fitted, states: np.ndarray, k: int) -> Float[n
     wrong = np.sum((inverse.reshape(3 * n, n, 3) * force[None, :, None]) ** 2, axis=(1, 2))
     slope = np.where(held[:, None], 0.0, np.asarray(frame.slope))
     response = np.einsum("ani,ni->an", inverse.reshape(3 * n, n, 3), slope)
-    d = len(fitted.free)
-    precision = fitted.square[:-1, :-1].copy()
-    precision[np.arange(n), np.arange(n)] += fitted.site_precision
-    precision[np.arange(n, n + d), np.arange(n, n + d)] += problem.sd(fitted.named) ** -2
-    known = np.linalg.inv(precision)[:n, :n]
     unsure = np.einsum("an,nm,am->a", response, known, response)
-    white = 1 / np.maximum(np.asarray(one.frame.precision)[:, 0, 0], 1.0)
+    white = 1 / np.maximum(np.asarray(seen.precision)[:, 0, 0], 1.0)
     noise = white + np.sum(problem.noise**2, axis=1)
     return np.sqrt(wrong.reshape(n, 3) + np.maximum(unsure, 0).reshape(n, 3) + noise[:, None])

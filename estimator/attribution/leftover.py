@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 from jiggle_mj.estimator.attribution.fit import DIRECTIONS, Fitted, cost_under, directions, linearised
 from jiggle_mj.estimator.attribution.linear import N_FIELDS, Metric
+from jiggle_mj.estimator.attribution.normal_equations import among_fields
 from jiggle_mj.estimator.attribution.problem import Problem
 
 VARIANCES = (1.0, 4.0, 16.0, 64.0)
@@ -37,7 +38,7 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
         glances, weights = linearised(wider, fitted.point, list(fitted.glances), along)
         whole = sum(float(_log_determinant(one)) for one in weights.values())
         fields = [
-            np.sum([np.asarray(glances[k].square)[-1 - N_FIELDS : -1, -1 - N_FIELDS : -1] for k in frames], axis=0)
+            np.sum([among_fields(np.asarray(glances[k].square)) for k in frames], axis=0)
             for frames in problem.by_part(glances).values()
         ]
         for ratio in AMPLITUDES:

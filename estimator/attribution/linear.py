@@ -13,12 +13,10 @@ state instead of the predicted one this would be an errors-in-variables problem,
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.sheet import Sheet, look
-from jiggle_mj.estimator.block_tridiagonal import lower_square
-from jiggle_mj.estimator.effects.mechanical import flat
+from jiggle_mj.estimator.attribution.sheet import Sheet, held_way, look, mean_of_held
+from jiggle_mj.estimator.effects.mechanical import cosines, flat
 from jiggle_mj.estimator.effects.sheet_model import Moment
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.filters.force_balance import ForceBalance, Frame
@@ -126,12 +124,14 @@ def glance(
         return unbalanced, look(changed, x, moment), changed.tool
 
     push, shown, taken = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
-    held = jnp.sum(jnp.where((frame.held & frame.visible)[:, None, None], shown, 0.0), axis=0) / _held_count(frame)
+    held = mean_of_held(frame, shown)
     moved = jnp.where(counted[:, None, None], shown, jnp.where(frame.held[:, None, None], held[None], 0.0))
     e = metric.forces(frame.y - look(model, x, moment)) + linear.unbalanced
     columns = jnp.concatenate([push - apply(moved), fields, e[:, :, None]], axis=2)
     square = _whole(metric, columns)
-    tool = jnp.concatenate([-held - taken, jnp.zeros((3, N_FIELDS)), _tool_off(frame, model, x, moment)[:, None]], 1)
+    tool = jnp.concatenate(
+        [-held - taken, jnp.zeros((3, N_FIELDS)), (held_way(model, frame, x, moment) - model.tool)[:, None]], 1
+    )
     return Glance(square=square, tool=jnp.where(moment.closed > 0, tool / TOOL_SD, 0.0)), metric
 
 
@@ -148,20 +148,15 @@ def misfit(
     model = sheet.model(theta, moment, frame.way)
     e = metric.forces(frame.y - look(model, x, moment))[:, :, None]
     against = metric.dot(jnp.concatenate([metric.fields, e], axis=2), e)[:, 0]
-    tool = _tool_off(frame, model, x, moment) / TOOL_SD
+    tool = (held_way(model, frame, x, moment) - model.tool) / TOOL_SD
     return Misfit(squared=against[-1], fields=against[:-1], tool=jnp.where(moment.closed > 0, tool, 0.0))
 
 
 def _whole(metric: Metric, columns: Float[Array, "n 3 k"]) -> Float[Array, "_k _k"]:
     """Inner products of D's columns, one a particle, and of others."""
     balance, frame = metric.balance, metric.frame
-    w, slope, layout, n = frame.weight, frame.slope, balance.layout, len(frame.s)
-    rows = jnp.einsum("npij,n,ni->npj", frame.rows, w, slope)
-    padded = layout.n_blocks * layout.width
-    slot = jnp.append(jnp.asarray(layout.slot), padded)[balance.neighbours]
-    V = jnp.zeros((padded + 1, 3, padded)).at[slot, :, jnp.asarray(layout.slot)[:, None]].add(rows)[:-1]
-    square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
-    own = jnp.diag(w * jnp.sum(slope**2, axis=1)) - square[layout.slot][:, layout.slot]
+    slope, n = frame.slope, len(frame.s)
+    own = balance.precision_along(frame, slope)
     shared = jnp.einsum("ni,nic->cn", slope, metric.noise)
     own = own - shared.T @ jax.scipy.linalg.cho_solve((metric.spread, True), shared)
     white = jax.vmap(lambda v: balance.whitened(frame, v), in_axes=2, out_axes=2)(columns)
@@ -178,18 +173,6 @@ def _fields(
     membrane: TriangleMembrane, rest: Float[Array, "n 3"], error: Float[Array, " n"]
 ) -> Float[Array, "n 3 fields"]:
     """Cosines over the sheet in each direction, of the force error's size."""
-    wave = jnp.cos(np.pi * jnp.arange(float(WAVES))[None, :, None] * flat(membrane, rest, rest)[:, None, :])
-    cosines = (wave[:, :, None, 0] * wave[:, None, :, 1]).reshape(len(rest), WAVES**2)
-    along = error[:, None, None, None] * cosines[:, None, :, None] * jnp.eye(3)[None, :, None, :]
+    waves = cosines(flat(membrane, rest, rest), WAVES)
+    along = error[:, None, None, None] * waves[:, None, :, None] * jnp.eye(3)[None, :, None, :]
     return along.reshape(len(rest), 3, N_FIELDS)
-
-
-def _tool_off(frame: ClosedFrame, model, x: Float[Array, "n 3"], moment: Moment) -> Float[Array, " 3"]:
-    """By how much what is held has gone further than the tool says [m]."""
-    both = (frame.held & frame.visible)[:, None]
-    gone = jnp.sum(jnp.where(both, x + frame.y - look(model, x, moment) - frame.closed_at, 0.0), axis=0)
-    return jnp.where(jnp.any(both), gone / _held_count(frame) - model.tool, 0.0)
-
-
-def _held_count(frame: ClosedFrame) -> Float[Array, ""]:
-    return jnp.maximum(jnp.sum(frame.held & frame.visible, dtype=float), 1.0)

@@ -5,6 +5,9 @@ from jaxtyping import Float
 from jiggle_mj.estimator.attribution.linear import GRASP_SD, N_FIELDS, TOOL_SD, Glance
 from jiggle_mj.estimator.attribution.problem import Problem
 
+FIELDS = slice(-1 - N_FIELDS, -1)
+"""Where the smooth force fields are in a frame's normal equations."""
+
 
 def reduced(problem: Problem, glances: dict[int, Glance], d: int) -> Float[np.ndarray, "k k"]:
     """Over s, the first d directions and -1."""
@@ -15,11 +18,24 @@ def reduced(problem: Problem, glances: dict[int, Glance], d: int) -> Float[np.nd
         n = len(whole) - rows.shape[2]
         whole[n:, n:] += less_offset(rows, rows)
         left = np.r_[0 : n + d, len(whole) - 1]
-        fields = np.arange(len(whole) - 1 - N_FIELDS, len(whole) - 1)
-        middle = whole[np.ix_(fields, fields)] + np.eye(N_FIELDS) / problem.amplitude**2
-        beside = whole[np.ix_(fields, left)]
+        middle = among_fields(whole) + np.eye(N_FIELDS) / problem.amplitude**2
+        beside = whole[FIELDS][:, left]
         total = total + whole[np.ix_(left, left)] - beside.T @ np.linalg.solve(middle, beside)
     return np.asarray(total)
+
+
+def among_fields(square: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "fields fields"]:
+    """What a frame's, or several frames', normal equations say of the smooth force fields."""
+    return square[FIELDS, FIELDS]
+
+
+def without_stiffnesses(
+    square: Float[np.ndarray, "k k"], site_precision: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "j j"]:
+    """Normal equations over all but s, with s eliminated as far as the belief leaves it open."""
+    n = len(site_precision)
+    beside = square[n:, :n]
+    return square[n:, n:] - beside @ np.linalg.solve(square[:n, :n] + np.diag(site_precision), beside.T)
 
 
 def less_offset(left: Float[np.ndarray, "t 3 a"], right: Float[np.ndarray, "t 3 b"]) -> Float[np.ndarray, "a b"]:

@@ -1,7 +1,7 @@
 """What a loop is closed over: the sheet, its frames, the noise, and what is believed beforehand."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import numpy as np
@@ -54,7 +54,7 @@ class Problem:
             sheet=sheet,
             history=History(gathered.frames, mesh.rest),
             prior=prior_belief(mesh, reference=float(balance.reference)),
-            noise=gathered.noise.fields(mesh.rest)[0],
+            noise=gathered.fields,
             prior_sd=np.concatenate([np.tile(effect.prior_sd, effect.sites) for effect in library]),
             own=np.concatenate([sheet.place(name) for name in own]).astype(int),
             own_sd=np.concatenate([np.asarray(sd) for sd in own.values()]),
@@ -63,7 +63,7 @@ class Problem:
     def widened(self, variance: float, amplitude: float) -> "Problem":
         """With that many times the variance of the forces, and smooth fields of another amplitude."""
         sheet = eqx.tree_at(lambda one: one.balance, self.sheet, self.sheet.balance.widened(variance))
-        return Problem(**{**vars(self), "sheet": sheet, "amplitude": amplitude})
+        return replace(self, sheet=sheet, amplitude=amplitude)
 
     def frames(self, parts: Iterable[int]) -> list[int]:
         """Frames of some parts."""

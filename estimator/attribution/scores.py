@@ -8,12 +8,12 @@ force fields are marginalised, g its score and theta ~ N(0, Theta) before,
 for each place where it may be, and the mean of the BFs over the places.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from jiggle_mj.estimator.attribution.fit import Fitted, directions, linearised
-from jiggle_mj.estimator.attribution.normal_equations import reduced
+from jiggle_mj.estimator.attribution.normal_equations import reduced, without_stiffnesses
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.effects.effect import Effect
 from scipy.stats import chi2
@@ -49,8 +49,7 @@ def scores(problem: Problem, fitted: Fitted) -> list[Score]:
         along = directions(problem, columns, TOGETHER)
         glances, _ = linearised(problem, fitted.point, list(fitted.glances), along)
         square = reduced(problem, glances, len(columns))
-        beside = square[n:, :n]
-        left = square[n:, n:] - beside @ np.linalg.solve(square[:n, :n] + np.diag(fitted.site_precision), beside.T)
+        left = without_stiffnesses(square, fitted.site_precision)
         for effect, site, at in pack:
             mine = np.array([list(columns).index(k) for k in at])
             found.setdefault(effect.name, []).append(
@@ -63,11 +62,8 @@ def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " 
     """Ln |I + Theta V| / 2 of a fit's named parameters, and their standard deviations."""
     if not len(fitted.named):
         return 0.0, np.zeros(0)
-    n, d = len(fitted.site_precision), len(fitted.named)
-    beside = fitted.square[n:-1, :n]
-    inner = fitted.square[:n, :n] + np.diag(fitted.site_precision)
-    left = fitted.square[n:-1, n:-1] - beside @ np.linalg.solve(inner, beside.T)
-    sd = problem.sd(fitted.named)
+    d, sd = len(fitted.named), problem.sd(fitted.named)
+    left = without_stiffnesses(fitted.square, fitted.site_precision)[:-1, :-1]
     own = left[d:, d:] + np.diag(sd[d:] ** -2)
     V = left[:d, :d] - left[:d, d:] @ np.linalg.solve(own, left[d:, :d])
     unit = V * np.outer(sd[:d], sd[:d]) + np.eye(d)
@@ -118,7 +114,7 @@ def _best(sites: list[Score]) -> Score:
     best = sites[int(np.argmax(evidence))]
     mean = best.log_bayes_factor + float(np.log(np.mean(np.exp(evidence - evidence.max()))))
     any_of = min(1.0, best.p_value * len(sites))
-    return Score(**{**vars(best), "log_bayes_factor": mean, "p_value": any_of})
+    return replace(best, log_bayes_factor=mean, p_value=any_of)
 
 
 def _packs(problem: Problem, fitted: Fitted) -> list[list[tuple[Effect, int, np.ndarray]]]:

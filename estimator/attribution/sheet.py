@@ -60,9 +60,15 @@ def look(model: SheetModel, x: Float[Array, "n 3"], moment: Moment) -> Float[Arr
 
 def held_way(model: SheetModel, frame: ClosedFrame, x: Float[Array, "n 3"], moment: Moment) -> Float[Array, " 3"]:
     """How far the held particles have gone as seen, the view's errors taken off [m]; as the tool says if none is."""
+    gone = mean_of_held(frame, x + frame.y - look(model, x, moment) - frame.closed_at)
+    return jnp.where(jnp.any(frame.held & frame.visible), gone, model.tool)
+
+
+def mean_of_held(frame: ClosedFrame, values: Float[Array, "n ..."]) -> Float[Array, "..."]:
+    """Over the held particles that are seen; zero if there are none."""
     both = frame.held & frame.visible
-    gone = jnp.where(both[:, None], x + frame.y - look(model, x, moment) - frame.closed_at, 0.0)
-    return jnp.where(jnp.any(both), jnp.sum(gone, axis=0) / jnp.maximum(jnp.sum(both, dtype=float), 1.0), model.tool)
+    among = jnp.expand_dims(both, tuple(range(1, values.ndim)))
+    return jnp.sum(jnp.where(among, values, 0.0), axis=0) / jnp.maximum(jnp.sum(both, dtype=float), 1.0)
 
 
 class Predicted(eqx.Module):

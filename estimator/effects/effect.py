@@ -31,8 +31,6 @@ class Effect:
     """Where the prior's scale comes from."""
     confounded_with: tuple[str, ...] = ()
     """Effects that often look like it, and attachments that do."""
-    remembers: bool = False
-    """Whether it depends on earlier states."""
     non_negative: bool = False
     """Whether parameters below 0 make no sense."""
     sensing: bool = False

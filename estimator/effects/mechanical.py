@@ -36,6 +36,12 @@ def spots(place: Float[Array, "m 2"]) -> Float[Array, "m spots"]:
     return (near[:, 0, :, None] * near[:, 1, None, :]).reshape(len(place), GRID**2)
 
 
+def cosines(place: Float[Array, "m 2"], waves: int) -> Float[Array, "m modes"]:
+    """Products of cosines along the two axes, that many along each, the constant first."""
+    wave = jnp.cos(np.pi * jnp.arange(float(waves))[None, :, None] * place[:, None, :])
+    return (wave[:, :, None, 0] * wave[:, None, :, 1]).reshape(len(place), waves**2)
+
+
 def _gravity(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
     weight = model.term(Weight)
     return model.with_term(eqx.tree_at(lambda t: t.gravity, weight, weight.gravity + STANDARD_GRAVITY * theta))
@@ -60,9 +66,7 @@ def _bending(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> Sh
 
 
 def _heterogeneity(model: SheetModel, theta: Float[Array, " modes"], moment: Moment) -> SheetModel:
-    place = _places(model, moment)
-    wave = jnp.cos(np.pi * jnp.arange(float(MODES))[None, :, None] * place[:, None, :])
-    modes = (wave[:, :, None, 0] * wave[:, None, :, 1]).reshape(len(place), MODES**2)[:, 1:]
+    modes = cosines(_places(model, moment), MODES)[:, 1:]
     return _stiffer(model, jnp.exp(modes @ theta)[:, None, None])
 
 

@@ -78,7 +78,6 @@ MEMORY = (
         prior_sd=(0.3,),
         source="wet bowel 0.01 to 0.05, muscle 0.3",
         confounded_with=("tissue_creep", "attachments"),
-        remembers=True,
         non_negative=True,
     ),
     Effect(
@@ -88,7 +87,6 @@ MEMORY = (
         prior_sd=(1e-3,),
         source="water around a sheet of 10 cm at 10 cm/s pulls with a hundredth of its stiffness",
         confounded_with=("material_damping", "image_latency", "inertia"),
-        remembers=True,
         non_negative=True,
     ),
     Effect(
@@ -98,7 +96,6 @@ MEMORY = (
         prior_sd=(1.0, 5.0),
         source="the sheet's own mass; a cloth in air swings for a second",
         confounded_with=("viscous_drag", "image_latency"),
-        remembers=True,
         non_negative=True,
     ),
     Effect(
@@ -108,7 +105,6 @@ MEMORY = (
         prior_sd=(0.2,),
         source="skin relaxes within 0.1 to 0.3 s",
         confounded_with=("viscous_drag", "tissue_creep", "image_latency"),
-        remembers=True,
         non_negative=True,
     ),
     Effect(
@@ -118,7 +114,6 @@ MEMORY = (
         prior_sd=(0.1,),
         source="skin under load creeps for minutes",
         confounded_with=("material_damping", "friction"),
-        remembers=True,
         non_negative=True,
     ),
     Effect(
@@ -128,7 +123,6 @@ MEMORY = (
         prior_sd=(0.3,),
         source="loose fascia gives within seconds",
         confounded_with=("attachments", "tissue_creep"),
-        remembers=True,
         non_negative=True,
     ),
 )

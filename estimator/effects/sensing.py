@@ -115,7 +115,6 @@ SENSING = (
         prior_sd=(0.2,),
         source="video of a surgical robot comes 0.06 to 0.26 s late",
         confounded_with=("tool_latency", "material_damping", "viscous_drag"),
-        remembers=True,
         sensing=True,
     ),
     Effect(

@@ -80,8 +80,6 @@ class Moment(eqx.Module):
     """From the one before that to the frame before [s]."""
     closed: Float[Array, ""]
     """Since the jaws closed [s]."""
-    index: Float[Array, " frames"]
-    """1 at the frame's own place among all frames with closed jaws."""
     now: Float[Array, "n 3"]
     """The frame's own state, as far as it is known already [m]."""
     before: Float[Array, "n 3"]

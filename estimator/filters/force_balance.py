@@ -200,16 +200,20 @@ class ForceBalance(eqx.Module):
 
     def information(self, frame: "Frame", fit: "Fit") -> "Information":
         """What the frame says of s, with its state eliminated."""
-        layout, w, slope = self.layout, frame.weight, self.calibrated(frame, fit)
-        whitened = w[:, None] * fit.left
+        slope, whitened = self.calibrated(frame, fit), frame.weight[:, None] * fit.left
+        pulled = -jnp.sum(slope * whitened, axis=1)
+        squared = jnp.sum(fit.residual * whitened)
+        return Information(precision=self.precision_along(frame, slope), pulled=pulled, squared=squared, at=frame.s)
+
+    def precision_along(self, frame: "Frame", slope: Float[Array, "n 3"]) -> Float[Array, "n n"]:
+        """D^T N^-1 D for a D with a column for each particle, which is `slope` there."""
+        layout, w = self.layout, frame.weight
         spread = jnp.einsum("npij,n,ni->npj", frame.rows, w, slope)
         padded = layout.n_blocks * layout.width
         slot = jnp.append(layout.slot, padded)[self.neighbours]
         V = jnp.zeros((padded + 1, 3, padded), spread.dtype).at[slot, :, layout.slot[:, None]].add(spread)[:-1]
         square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
-        precision = jnp.diag(w * jnp.sum(slope**2, axis=1)) - square[layout.slot][:, layout.slot]
-        pulled = -jnp.sum(slope * whitened, axis=1)
-        return Information(precision=precision, pulled=pulled, squared=jnp.sum(fit.residual * whitened), at=frame.s)
+        return jnp.diag(w * jnp.sum(slope**2, axis=1)) - square[layout.slot][:, layout.slot]
 
     def whitened(self, frame: "Frame", v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """N^-1 v."""
