@@ -9,10 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jiggle_mj.estimator.attribution import scores
 from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
-from jiggle_mj.estimator.attribution.fit import DIRECTIONS
 from jiggle_mj.estimator.attribution.gather import assumed, gather
 from jiggle_mj.estimator.attribution.still_noise import measure
 from jiggle_mj.estimator.attribution.users_effects import check_effects
@@ -84,14 +82,6 @@ def closed_over(observations: list[Observation]):
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(gathered, library=SMALL)
         return closed, discrepancy(closed, gathered)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_width():
-    """Scores look at as many parameters together as fits do, which saves compiling for another number."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scores, "TOGETHER", DIRECTIONS)
-        yield
 
 
 @pytest.fixture(scope="module")

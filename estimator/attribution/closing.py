@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, cost_under, fit, gains_over, start
+from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, cost_under, fit, gains_over, start, without
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
@@ -24,17 +24,16 @@ LOOKED_AT = 3
 ENTER = 10.0
 """Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
 LEAD = 3.0
-"""By how much it must lead the next to be named alone where nothing is left out [nat]."""
-AS_GOOD = 0.9
-"""Share of its error from which an effect counts as no worse than the best."""
-COMPARED = 0.5
-"""Effects with this share of the best log Bayes factor or more are compared by what they foretell."""
+"""By how much it must lead the next to be named alone, whatever the shares [nat]."""
+AS_GOOD, CONFUSED = 0.9, 0.75
+"""Shares of its error from which an effect counts as no worse than the best, and one that is often confused with it."""
+COMPARED, EXPLAINED = 0.5, 0.85
+"""Shares of the best log Bayes factor from which effects are compared by what they foretell, and from which they count
+as explaining as much."""
 MOST = 3
 """Effects that are added at most."""
 ABSURD = 3.5
 """Prior standard deviations beyond which a parameter makes no sense."""
-FOLD_PASSES = 2
-"""Gauss-Newton steps where one grasp is left out of a fit that has found its end."""
 BETTER, DECISIVE = 0.97, 0.8
 """Shares of the error over all parts left out that an effect must bring it to, and from which on it need not beat
 larger errors without a cause."""
@@ -127,7 +126,7 @@ def close_the_loop(
         for trial in trials:
             if passed and trial.log_bayes_factor < COMPARED * passed[0].log_bayes_factor:
                 break
-            judged = _judged(problem, trial, used)
+            judged = _judged(problem, trial, used, say)
             why = _against(judged, stages[-1])
             if why is None:
                 passed.append(judged)
@@ -177,11 +176,7 @@ def _declared(problem: Problem, gathered: Gathered, used: set[int], say: Callabl
 def _folds(problem: Problem, fitted: Fitted, used: set[int]) -> list[Foretold]:
     if len(used) < 2:
         return []
-    parts = []
-    for part in sorted(used):
-        without = fit(problem, fitted.named, fitted.point, used - {part}, passes=FOLD_PASSES)
-        parts.append(foretell(problem, without, part))
-    return parts
+    return [foretell(problem, without(problem, fitted, part), part) for part in sorted(used)]
 
 
 def _trials(
@@ -200,20 +195,26 @@ def _trials(
 
 
 def _not_told_from(one: Trial, best: Trial) -> bool:
-    """Whether an effect foretells what was left out about as well as the best, or is often confused with it.
+    """Whether an effect explains as much as the best, and foretells what was left out about as well.
 
-    Only those that explain at least half as much as the likeliest are asked. Where nothing was left out, evidence says.
+    For two that are often confused with each other it takes less.
     """
+    likelier = best.log_bayes_factor - one.log_bayes_factor
+    if not best.folds:
+        return likelier < LEAD
     if one.effect.name in best.effect.confounded_with and best.effect.name in one.effect.confounded_with:
-        return True
-    if best.folds:
-        return one.missed * AS_GOOD <= best.missed
-    return best.log_bayes_factor - one.log_bayes_factor < LEAD
+        return one.missed * CONFUSED <= best.missed
+    as_likely = likelier < max(LEAD, (1 - EXPLAINED) * best.log_bayes_factor)
+    return as_likely and one.missed * AS_GOOD <= best.missed
 
 
-def _judged(problem: Problem, trial: Trial, used: set[int]) -> Trial:
+def _judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str], None]) -> Trial:
     """With what it leaves over and how it foretells."""
-    return replace(trial, left=leftover(problem, trial.fitted), folds=_folds(problem, trial.fitted, used))
+    left = leftover(problem, trial.fitted)
+    judged = replace(trial, left=left, folds=_folds(problem, trial.fitted, used))
+    foretold = f", foretells to {1e3 * judged.missed:.2f} mm" if judged.folds else ""
+    say(f"{trial.effect.name} leaves {left.gain:.1f} nat to larger errors{foretold}")
+    return judged
 
 
 def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial], used: set[int]) -> Trial:

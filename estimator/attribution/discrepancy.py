@@ -28,7 +28,12 @@ def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
             for one in first.scores
         ],
         "left_over": [
-            {"gain": one.left.gain, "force_variance": one.left.variance, "smooth_amplitude": one.left.amplitude}
+            {
+                "gain": one.left.gain,
+                "force_variance": one.left.variance,
+                "smooth_amplitude": one.left.amplitude,
+                "tool_variance": one.left.tool_variance,
+            }
             for one in closed.stages
         ],
         "held_out": {

@@ -6,7 +6,7 @@ more. Stiffnesses go where samples of the belief say.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,8 +31,8 @@ SHORTER = (1.0, 0.4, 0.15, 0.05)
 FARTHEST, OWN_FARTHEST, FAR = 4.0, 3.0, 1.5
 """Most that an effect's parameter and one of the sheet's own may be from 0, and that one may change in a step, in prior
 standard deviations."""
-GAIN = 1.0
-"""Of a step, below which the fit has come to its end [nat]."""
+GAIN = 1e-3
+"""Share of its cost by which a step must lessen it; below, the fit has come to its end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,17 +80,32 @@ def fit(
         say(f"pass {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
         gained = now.cost - cost
         now, step = _reckoned(problem, named, trial, problem.frames(parts))
-        if gained < 2 * GAIN:
+        if gained < GAIN * cost:
             break
     return now
+
+
+def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
+    """One more step from the end of a fit, with the frames of one part left out, by what is known there already."""
+    left = [k for k in fitted.glances if k not in problem.frames({part})]
+    glances, weights = {k: fitted.glances[k] for k in left}, {k: fitted.weights[k] for k in left}
+    now, step = _found(problem, fitted.named, fitted.point, glances, weights)
+    better = _shortened(problem, now, step)
+    return now if better is None else replace(now, point=better[0], cost=better[1])
 
 
 def _reckoned(
     problem: Problem, named: np.ndarray, point: Point, frames: list[int]
 ) -> tuple[Fitted, tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]]:
     """A point with what is known there, and the step from it."""
+    along = directions(problem, problem.free(named), DIRECTIONS)
+    return _found(problem, named, point, *linearised(problem, point, frames, along))
+
+
+def _found(
+    problem: Problem, named: np.ndarray, point: Point, glances: dict[int, Glance], weights: dict[int, Metric]
+) -> tuple[Fitted, tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]]:
     free, sd = problem.free(named), problem.sd(named)
-    glances, weights = linearised(problem, point, frames, directions(problem, free, DIRECTIONS))
     square = reduced(problem, glances, len(free))
     step, sites = _step(problem, square, point, free, sd)
     found = Fitted(

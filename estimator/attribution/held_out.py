@@ -100,7 +100,7 @@ def _sd(
     wrong = np.sum((inverse.reshape(3 * n, n, 3) * force[None, :, None]) ** 2, axis=(1, 2))
     slope = np.where(held[:, None], 0.0, np.asarray(frame.slope))
     response = np.einsum("ani,ni->an", inverse.reshape(3 * n, n, 3), slope)
-    unsure = np.einsum("an,nm,am->a", response, known, response)
+    unsure = np.sum((response @ known) * response, axis=1)
     white = 1 / np.maximum(np.asarray(seen.precision)[:, 0, 0], 1.0)
     noise = white + np.sum(problem.noise**2, axis=1)
     return np.sqrt(wrong.reshape(n, 3) + np.maximum(unsure, 0).reshape(n, 3) + noise[:, None])

@@ -1,7 +1,8 @@
 """What a fit leaves that its own errors do not account for: how much larger they would have to be.
 
-The likelihood of larger force errors, and of smooth force fields of larger amplitude, against that of the usual ones.
-It stands for all causes that have no name here: an effect must do better than that.
+The likelihood of larger force errors, of smooth force fields of larger amplitude and of a tool that reports its way
+less well, against that of the usual ones. It stands for all causes that have no name here: an effect must do better
+than that.
 """
 
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jiggle_mj.estimator.attribution.fit import DIRECTIONS, Fitted, cost_under, directions, linearised
 from jiggle_mj.estimator.attribution.linear import N_FIELDS, Metric
-from jiggle_mj.estimator.attribution.normal_equations import among_fields
+from jiggle_mj.estimator.attribution.normal_equations import among_fields, less_offset
 from jiggle_mj.estimator.attribution.problem import Problem
 
 VARIANCES = (1.0, 4.0, 16.0, 64.0)
@@ -26,7 +27,11 @@ class Leftover:
     gain: float
     """By how much the frames are likelier with them than with the usual ones [nat]."""
     variance: float
+    """Of the forces, in units of the usual."""
     amplitude: float
+    """Of the smooth fields."""
+    tool_variance: float
+    """Of what the tool says of the held particles."""
 
 
 def leftover(problem: Problem, fitted: Fitted) -> Leftover:
@@ -35,7 +40,10 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
     along = directions(problem, fitted.free, DIRECTIONS)
     for variance in VARIANCES:
         wider = problem.widened(variance, problem.amplitude)
-        glances, weights = linearised(wider, fitted.point, list(fitted.glances), along)
+        if variance == 1.0:
+            glances, weights = fitted.glances, fitted.weights
+        else:
+            glances, weights = linearised(wider, fitted.point, list(fitted.glances), along)
         whole = sum(float(_log_determinant(one)) for one in weights.values())
         fields = [
             np.sum([among_fields(np.asarray(glances[k].square)) for k in frames], axis=0)
@@ -48,7 +56,19 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
             likelihoods[variance, ratio] = -(cost + whole + common) / 2
     best = max(likelihoods, key=lambda key: likelihoods[key])
     gain = likelihoods[best] - likelihoods[1.0, 1.0]
-    return Leftover(gain=gain, variance=best[0], amplitude=best[1])
+    tool, gain_of_tool = _of_tool(problem, fitted)
+    return Leftover(gain=gain + gain_of_tool, variance=best[0], amplitude=best[1], tool_variance=tool)
+
+
+def _of_tool(problem: Problem, fitted: Fitted) -> tuple[float, float]:
+    """The likeliest variance of what the tool says of the held particles, in units of the usual, and its gain [nat]."""
+    squared = 0.0
+    for frames in problem.by_part(fitted.glances).values():
+        rows = np.array([np.asarray(fitted.glances[k].tool)[:, -1:] for k in frames])
+        squared += float(less_offset(rows, rows)[0, 0])
+    degrees = 3 * len(fitted.glances)
+    variance = max(squared / degrees, 1.0)
+    return variance, 0.5 * (squared - squared / variance - degrees * np.log(variance))
 
 
 @eqx.filter_jit

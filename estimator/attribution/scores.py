@@ -12,14 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.fit import Fitted, directions, linearised
+from jiggle_mj.estimator.attribution.fit import Fitted, linearised
 from jiggle_mj.estimator.attribution.normal_equations import reduced, without_stiffnesses
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.effects.effect import Effect
 from scipy.stats import chi2
-
-TOGETHER = 76
-"""Parameters that are looked at together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,21 +38,16 @@ class Score:
 
 def scores(problem: Problem, fitted: Fitted) -> list[Score]:
     """Every effect of the library that was not fitted already, the likeliest first."""
-    n = len(fitted.site_precision)
-    found: dict[str, list[Score]] = {}
-    always = fitted.free
-    for pack in _packs(problem, fitted):
-        columns = np.concatenate([always, *(np.setdiff1d(at, always) for _, _, at in pack)]).astype(int)
-        along = directions(problem, columns, TOGETHER)
-        glances, _ = linearised(problem, fitted.point, list(fitted.glances), along)
-        square = reduced(problem, glances, len(columns))
-        left = without_stiffnesses(square, fitted.site_precision)
-        for effect, site, at in pack:
-            mine = np.array([list(columns).index(k) for k in at])
-            found.setdefault(effect.name, []).append(
-                _one(problem, fitted, effect, site, left, square[n:, n:], mine, columns)
-            )
-    return sorted(map(_best, found.values()), key=lambda one: -one.log_bayes_factor)
+    n, all_ways = len(fitted.site_precision), np.eye(problem.sheet.size)
+    glances, _ = linearised(problem, fitted.point, list(fitted.glances), all_ways)
+    square = reduced(problem, glances, problem.sheet.size)
+    left, whole = without_stiffnesses(square, fitted.site_precision), square[n:, n:]
+    found = [
+        _best([_one(problem, fitted, effect, site, left, whole) for site in range(effect.sites)])
+        for effect in problem.sheet.library
+        if not np.isin(problem.sheet.place(effect.name), fitted.named).any()
+    ]
+    return sorted(found, key=lambda one: -one.log_bayes_factor)
 
 
 def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " named"]]:
@@ -71,26 +63,19 @@ def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " 
 
 
 def _one(
-    problem: Problem,
-    fitted: Fitted,
-    effect: Effect,
-    site: int,
-    left: np.ndarray,
-    whole: np.ndarray,
-    mine: np.ndarray,
-    columns: np.ndarray,
+    problem: Problem, fitted: Fitted, effect: Effect, site: int, left: Float[np.ndarray, "j j"], whole: np.ndarray
 ) -> Score:
-    sd_of = dict(zip(fitted.free, problem.sd(fitted.named), strict=True))
-    rest = np.array([k for k in range(len(fitted.free)) if k not in mine], dtype=int)
-    sd_rest = np.array([sd_of[columns[k]] for k in rest])
-    at = fitted.point.theta[columns]
+    """At one place, from normal equations over all parameters and -1, with and without s eliminated."""
+    mine = problem.sheet.place(effect.name, site)
+    others = ~np.isin(fitted.free, mine)
+    rest, sd_rest = fitted.free[others], problem.sd(fitted.named)[others]
     free = left[np.ix_(rest, rest)] + np.diag(sd_rest**-2)
     pulled = left[np.ix_(rest, np.append(mine, len(left) - 1))]
-    pulled[:, -1] += at[rest] / sd_rest**2
+    pulled[:, -1] += fitted.point.theta[rest] / sd_rest**2
     pull = np.linalg.solve(free, pulled)
     V = left[np.ix_(mine, mine)] - left[np.ix_(mine, rest)] @ pull[:, :-1]
     g = -(left[mine, -1] - left[np.ix_(mine, rest)] @ pull[:, -1])
-    sd = problem.prior_sd[columns[mine]]
+    sd = problem.prior_sd[mine]
     unit, scaled, eye = V * np.outer(sd, sd), g * sd, np.eye(len(mine))
     theta = np.linalg.solve(unit + eye, scaled)
     senseless = effect.non_negative and theta[0] < 0
@@ -115,21 +100,3 @@ def _best(sites: list[Score]) -> Score:
     mean = best.log_bayes_factor + float(np.log(np.mean(np.exp(evidence - evidence.max()))))
     any_of = min(1.0, best.p_value * len(sites))
     return replace(best, log_bayes_factor=mean, p_value=any_of)
-
-
-def _packs(problem: Problem, fitted: Fitted) -> list[list[tuple[Effect, int, np.ndarray]]]:
-    """Effects' sites, as many together as there is room for."""
-    packs: list[list[tuple[Effect, int, np.ndarray]]] = [[]]
-    room = TOGETHER - len(fitted.free)
-    for effect in problem.sheet.library:
-        if np.isin(problem.sheet.place(effect.name), fitted.named).any():
-            continue
-        for site in range(effect.sites):
-            at = problem.sheet.place(effect.name, site)
-            new = len(np.setdiff1d(at, fitted.free))
-            if new > room:
-                packs.append([])
-                room = TOGETHER - len(fitted.free)
-            room -= new
-            packs[-1].append((effect, site, at))
-    return packs

@@ -58,9 +58,19 @@ def look(model: SheetModel, x: Float[Array, "n 3"], moment: Moment) -> Float[Arr
     return model.view(x, before=moment.before, tangents=tangents(model.term(TriangleMembrane), x))
 
 
-def held_way(model: SheetModel, frame: ClosedFrame, x: Float[Array, "n 3"], moment: Moment) -> Float[Array, " 3"]:
+def closed_on(sheet: Sheet, theta: Float[Array, " p"], frame: ClosedFrame, moment: Moment) -> Float[Array, "n 3"]:
+    """Where the jaws closed on the held particles, the errors that the view had then taken off [m]."""
+    then = (moment.time - moment.closed, jnp.zeros_like(moment.closed))
+    model = sheet.model(theta, eqx.tree_at(lambda m: (m.time, m.closed), moment, then), frame.way)
+    along = tangents(model.term(TriangleMembrane), moment.rest)
+    return 2 * frame.closed_at - model.view(frame.closed_at, before=frame.closed_at, tangents=along)
+
+
+def held_way(
+    model: SheetModel, frame: ClosedFrame, closed: Float[Array, "n 3"], x: Float[Array, "n 3"], moment: Moment
+) -> Float[Array, " 3"]:
     """How far the held particles have gone as seen, the view's errors taken off [m]; as the tool says if none is."""
-    gone = mean_of_held(frame, x + frame.y - look(model, x, moment) - frame.closed_at)
+    gone = mean_of_held(frame, x + frame.y - look(model, x, moment) - closed)
     return jnp.where(jnp.any(frame.held & frame.visible), gone, model.tool)
 
 
@@ -91,8 +101,8 @@ def predict(
 ) -> Predicted:
     """The equilibrium, searched from `start`; what is held goes where it was seen, or where the tool says."""
     model = sheet.model(theta, moment, frame.way)
-    way = jnp.where(by_tool, model.tool, held_way(model, frame, start, moment))
-    to = frame.closed_at + way[None]
+    closed = closed_on(sheet, theta, frame, moment)
+    to = closed + jnp.where(by_tool, model.tool, held_way(model, frame, closed, start, moment))[None]
     precision = jnp.broadcast_to(GRIPPED * jnp.eye(3)[None], (len(s), 3, 3))
     gripped = Evidence(y=to, precision=precision, held=frame.held, loaded=frame.loaded)
     begun = jnp.where(frame.held[:, None], to, start)

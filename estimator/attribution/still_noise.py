@@ -4,7 +4,8 @@ White noise on each point, and a smooth field of it over the sheet,
 
     cov(n_i, n_j) = sd^2 [i = j] + smooth_sd^2 exp(-|a_i - a_j|^2 / 2 length^2)
 
-for each coordinate alike. Never from what a fit leaves over: that holds the effects that are looked for.
+for each coordinate alike. From one frame to the next, so that what drifts or jumps does not count; and never from what
+a fit leaves over: that holds the effects that are looked for.
 """
 
 from dataclasses import dataclass
@@ -24,6 +25,9 @@ KEPT = 0.97
 """Share of the smooth part's variance that they hold; the rest counts as white."""
 FEWEST = 5
 """Still frames from which noise is measured."""
+
+JUMP = 4.0
+"""Times the usual square of a difference, beyond which something else has happened between two frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +63,9 @@ def measure(
     frames = len(positions)
     if frames < FEWEST or seen.sum() < 3:
         return None
-    off = positions[:, seen] - positions[:, seen].mean(axis=0)
-    off *= np.sqrt(frames / (frames - 1))
+    off = np.diff(positions[:, seen], axis=0) / np.sqrt(2)
+    squares = np.mean(off**2, axis=(1, 2))
+    off = off[squares <= JUMP * np.median(squares)]
     total = float(np.mean(off**2))
     i, j = np.random.default_rng(seed).integers(0, int(seen.sum()), (2, PAIRS))
     i, j = i[i != j], j[i != j]

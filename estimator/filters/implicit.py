@@ -238,7 +238,16 @@ def _swept(belief: AttachmentBelief) -> Stated:
 
 
 def _sampled(belief: Any, rounds: tuple[int, int]) -> Stated:
-    return _state_sampled(belief, *map(jnp.asarray, rounds))
+    """On a CPU where JAX has one: samples follow one another, and a GPU takes ten times as long."""
+    with jax.default_device(_cpus()[0]):
+        return _state_sampled(belief, *map(jnp.asarray, rounds))
+
+
+def _cpus() -> list[Any]:
+    try:
+        return jax.devices("cpu")
+    except RuntimeError:  # JAX_PLATFORMS leaves it out
+        return jax.devices()
 
 
 @eqx.filter_jit
