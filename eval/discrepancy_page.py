@@ -17,7 +17,7 @@ from jiggle_mj.estimate import Sheet
 
 SHOWN = 12
 """Effects in the picture of scores."""
-BEFORE, AFTER = "#d55e00", "#0072b2"
+BEFORE, AFTER, RING = "#d55e00", "#0072b2", "#e8000b"
 VERDICTS = {
     "no-effect": "Nothing is missing that these frames could show.",
     "effect": "One cause is named, and it explains what was left.",
@@ -31,15 +31,12 @@ def story(found: Mapping[str, Any]) -> list[str]:
     """What was found, in sentences."""
     told = [VERDICTS[found["verdict"]]]
     for one in found["effects"]:
-        sizes = ", ".join(
-            f"{value:.4g} ± {sd:.2g} {unit}".strip()
-            for value, sd, unit in zip(one["theta"], one["sd"], one["units"], strict=True)
-        )
+        sizes = ", ".join(_size(*each) for each in zip(one["theta"], one["sd"], one["units"], strict=True))
         told.append(f"Added: {one['name']} ({sizes}), log Bayes factor {one['log_bayes_factor']:.0f}.")
         if one["this_session_alone"]:
             told.append(f"{one['name']} is of the tool, camera or tracker, and holds for this session alone.")
     if found["ambiguous_with"]:
-        told.append(f"As likely, within 3 nat: {', '.join(found['ambiguous_with'])}.")
+        told.append(f"It may as well be: {', '.join(found['ambiguous_with'])}.")
     told += [f"Refused: {one['name']}, since {one['why']}." for one in found["refused"]]
     held = found["held_out"]
     if held["folds"] and found["effects"]:
@@ -62,6 +59,14 @@ def story(found: Mapping[str, Any]) -> list[str]:
     return told
 
 
+def _size(value: float, sd: float, unit: str) -> str:
+    """A parameter with its standard deviation, to the digits that it has; lengths and angles in thousandths."""
+    if unit.partition("/")[0] in ("m", "rad"):
+        value, sd, unit = 1e3 * value, 1e3 * sd, f"m{unit}"
+    digits = max(0, 1 - int(np.floor(np.log10(sd)))) if sd > 0 else 3
+    return f"{value:.{digits}f} ± {sd:.{digits}f} {unit}".strip()
+
+
 TIMES = ("before", "after")
 
 
@@ -81,6 +86,7 @@ def write_page(path: Path, *, name: str, sheet: Sheet, found: Mapping[str, Any])
         sentences=story(found),
         pictures=Markup(pictures),
         detections=[(when, found[f"detection_{when}"]) for when in TIMES if found[f"detection_{when}"] is not None],
+        share=lambda value: "-" if value is None else f"{value:.2f}",
     )
     try:
         path.write_text(text)
@@ -93,7 +99,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         rows=3,
         cols=2,
         subplot_titles=(
-            "mean miss on the sheet, before [mm]",
+            "mean miss on the sheet, before [mm]; ringed: found attached",
             "after [mm]",
             "log Bayes factor of each effect, one linear step [nat]",
             "what the miss goes with (rank correlation), before and after",
@@ -109,9 +115,10 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         for when, key in zip(TIMES, ("localisation", "localisation_after"), strict=True)
     }
     most = float(np.nanmax([np.nanmax(miss) for miss in misses.values()]))
-    for column, miss in enumerate(misses.values(), start=1):
+    for column, (miss, key) in enumerate(zip(misses.values(), ("localisation", "localisation_after"), strict=True), 1):
         marker = {"color": miss, "cmin": 0, "cmax": most, "colorscale": "Viridis", "showscale": column == 2, "size": 9}
         marker["colorbar"] = {"len": 0.28, "y": 0.87}
+        marker["line"] = {"color": RING, "width": [2.5 if one else 0 for one in found[key]["particles"]["attached"]]}
         dots = go.Scatter(x=1e3 * flat[:, 0], y=1e3 * flat[:, 1], mode="markers", marker=marker, showlegend=False)
         figure.add_trace(dots, row=1, col=column)
         figure.update_yaxes(scaleanchor=f"x{'' if column == 1 else column}", row=1, col=column)
@@ -134,5 +141,11 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         bars = go.Bar(x=labels, y=[None if one is None else 1e3 * one for one in held], marker={"color": colour},
                       name=when, showlegend=False)  # fmt: skip
         figure.add_trace(bars, row=3, col=2)
-    figure.update_layout(height=1250, template="plotly_white", barmode="group", margin={"l": 40, "r": 20})
+    figure.update_layout(
+        legend={"orientation": "h", "x": 0.62, "y": 0.685, "traceorder": "normal"},
+        height=1250,
+        template="plotly_white",
+        barmode="group",
+        margin={"l": 40, "r": 20},
+    )
     return figure

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from jiggle_mj.eval.closing_the_loop import DISCREPANCY, close_loop
-from jiggle_mj.eval.tables import carry_out
+from jiggle_mj.eval.tables import VERSION, carry_out
 from jiggle_mj.scenes import Reference, Scene, load_scene, programme
 from jiggle_mj.scenes.anchor_disturbances import (
     AnchorBreak,
@@ -43,6 +43,7 @@ from jiggle_mj.scenes.world_disturbances import Bed, Friction, Gravity, ViscousD
 
 from jiggle_mj.episode import observe
 from jiggle_mj.mcap_files import truth_path
+from jiggle_mj.recording_declaration import file_metadata
 
 LATE = 2.2
 """When what would else be in the rest shape begins: after the still frames, before the first grasp [s]."""
@@ -115,7 +116,7 @@ def scene_with(undeclared: str, seed: int) -> Scene:
 def measure(
     names: Iterable[str], seeds: Iterable[int], directory: Path, *, executor: Executor, say: Callable[[str], None]
 ) -> Found:
-    """Run what has not been run, and read all of it.
+    """Run what has not been run by this version, and read all of it.
 
     Args:
         names: of `INSIDE`, `OUTSIDE` and `NOTHING`.
@@ -126,12 +127,14 @@ def measure(
     """
     folders = {(name, seed): directory / f"{name.replace(' ', '_')}-{seed}" for name, seed in product(names, seeds)}
     left = {
-        folder.name: partial(_run, *key, folder)
-        for key, folder in folders.items()
-        if not (folder / DISCREPANCY).exists()
+        folder.name: partial(_run, *key, folder) for key, folder in folders.items() if not _done(folder / DISCREPANCY)
     }
     carry_out(left, executor, say=say)
     return {key: json.loads((folder / DISCREPANCY).read_text()) for key, folder in folders.items()}
+
+
+def _done(file: Path) -> bool:
+    return file.exists() and json.loads(file.read_text()).get(VERSION) == file_metadata()[VERSION]
 
 
 def _run(undeclared: str, seed: int, folder: Path) -> None:

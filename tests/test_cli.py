@@ -181,3 +181,17 @@ def test_the_module_can_be_run():
     assert done.returncode == 0
     for verb in ("run", "record", "import", "estimate", "score", "doctor"):
         assert verb in done.stdout
+
+
+@pytest.mark.slow
+def test_close_loop_writes_what_it_found_and_a_page(whole, tmp_path, monkeypatch, capsys):
+    _, _, made = whole
+    arguments = (made / "run.mcap", "--truth", made / "run.truth.mcap", "--out", tmp_path / "closed", "--json")
+    assert call(monkeypatch, "close-loop", *arguments) == 0
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
+    assert found == json.loads((tmp_path / "closed" / "discrepancy.json").read_text())
+    assert found["detection_after"]["n_attached"] > 0
+    assert "scores: " in printed.err and found["verdict"] in printed.err
+    assert found["verdict"] in (tmp_path / "closed" / "discrepancy.html").read_text()
+    assert call(monkeypatch, "close-loop", *arguments) == 2  # what is there is not replaced unasked

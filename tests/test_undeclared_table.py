@@ -7,7 +7,10 @@ import pytest
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.eval import undeclared_table
 from jiggle_mj.eval.closing_the_loop import DISCREPANCY
+from jiggle_mj.eval.tables import VERSION
 from jiggle_mj.eval.undeclared_table import INSIDE, NOTHING, OUTSIDE, markdown, measure, scene_with
+
+from jiggle_mj.recording_declaration import file_metadata
 
 
 def found(verdict: str, *names: str, after: float = 1e-3, also: tuple[str, ...] = ()) -> dict:
@@ -60,19 +63,21 @@ def test_counts():
     assert "Not in the library: 1 of 2 unexplained or with a remainder." in said
 
 
-def test_what_is_there_is_not_run_again(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("version", "times"), [(file_metadata()[VERSION], 1), ("0.0", 2)])
+def test_what_this_version_ran_is_not_run_again(tmp_path, monkeypatch, version, times):
     ran = []
 
     def run(name, seed, folder):
         ran.append((name, seed))
-        folder.mkdir()
-        (folder / DISCREPANCY).write_text(json.dumps(found("no-effect")))
+        folder.mkdir(exist_ok=True)
+        (folder / DISCREPANCY).write_text(json.dumps({VERSION: version} | found("no-effect")))
 
     monkeypatch.setattr(undeclared_table, "_run", run)
     with ThreadPoolExecutor(1) as executor:
         runs = [measure(["tool scale"], [0, 1], tmp_path, executor=executor, say=lambda _: None) for _ in range(2)]
-    assert ran == [("tool scale", 0), ("tool scale", 1)]
-    assert [list(one) for one in runs] == [ran, ran]
+    both = [("tool scale", 0), ("tool scale", 1)]
+    assert ran == times * both
+    assert [list(one) for one in runs] == [both, both]
 
 
 @pytest.mark.slow

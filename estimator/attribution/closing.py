@@ -25,7 +25,7 @@ ENTER = 10.0
 """Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
 LEAD = 3.0
 """By how much it must lead the next to be named alone, whatever the shares [nat]."""
-AS_GOOD, CONFUSED = 0.9, 0.75
+AS_GOOD, CONFUSED = 0.9, 0.6
 """Shares of its error from which an effect counts as no worse than the best, and one that is often confused with it."""
 COMPARED, EXPLAINED = 0.5, 0.85
 """Shares of the best log Bayes factor from which effects are compared by what they foretell, and from which they count
