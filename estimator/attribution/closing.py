@@ -28,8 +28,8 @@ LEAD = 3.0
 AS_GOOD, CONFUSED = 0.9, 0.6
 """Shares of its error from which an effect counts as no worse than the best, and one that is often confused with it."""
 COMPARED, EXPLAINED = 0.5, 0.85
-"""Shares of the best log Bayes factor from which effects are compared by what they foretell, and from which they count
-as explaining as much."""
+"""Shares of the best log Bayes factor from which effects are compared by what they foretell (and fitted, if often
+confused with the best), and from which they count as explaining as much."""
 MOST = 3
 """Effects that are added at most."""
 ABSURD = 3.5
@@ -186,12 +186,22 @@ def _trials(
     found = scores(problem, stage.fitted)
     stage.scores.extend(found)
     say("scores: " + ", ".join(f"{one.name} {one.log_bayes_factor:.1f}" for one in found[:6]))
-    likely = [one for one in found if one.log_bayes_factor > ENTER][:LOOKED_AT]
-    trials = [_fitted(problem, stage, one, accepted, used) for one in likely]
+    trials = [_fitted(problem, stage, one, accepted, used) for one in _likely(problem, found)]
     for one in trials:
         say(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
     trials = [one for one in trials if one.log_bayes_factor > ENTER]
     return sorted(trials, key=lambda one: (not one.sensible, -one.log_bayes_factor))
+
+
+def _likely(problem: Problem, found: list[Score]) -> list[Score]:
+    """Those worth a fit: the likeliest, and what the first of them is often confused with, if it is not far behind."""
+    entering = [one for one in found if one.log_bayes_factor > ENTER]
+    if not entering:
+        return []
+    first = entering[0]
+    confused = next(one for one in problem.sheet.library if one.name == first.name).confounded_with
+    near = [one for one in entering[LOOKED_AT:] if one.log_bayes_factor > COMPARED * first.log_bayes_factor]
+    return entering[:LOOKED_AT] + [one for one in near if one.name in confused]
 
 
 def _not_told_from(one: Trial, best: Trial) -> bool:
