@@ -19,13 +19,13 @@ from jaxtyping import Float
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.policies.procedures import ROOM, free_stretch, tour
-from jiggle_mj.eval.tables import VERSION, carry_out
+from jiggle_mj.eval.tables import carry_out
 from jiggle_mj.scenes import Reference, load_scene
 from jiggle_mj.scenes.programme import grasp_points, programme
 from jiggle_mj.scenes.scene import Scene
 
 from jiggle_mj.observation import Action, Cut, Suture, Wait
-from jiggle_mj.recording_declaration import file_metadata
+from jiggle_mj.recording_declaration import is_current, made_by
 
 SCENES = ("arc", "line", "line_dot", "arc_line", "u_shape")
 PLACES = 2
@@ -75,14 +75,14 @@ def measure(
 
 def _run(scene: str, seed: int, file: Path) -> None:
     found = [vars(verdict) for verdict in verdicts(load_scene(scene), seed)]
-    file.write_text(json.dumps({VERSION: file_metadata()[VERSION], "verdicts": found}, indent=1) + "\n")
+    file.write_text(json.dumps(made_by() | {"verdicts": found}, indent=1) + "\n")
 
 
 def _read(file: Path) -> list[Verdict] | None:
     if not file.exists():
         return None
     written = json.loads(file.read_text())
-    return [Verdict(**one) for one in written["verdicts"]] if written[VERSION] == file_metadata()[VERSION] else None
+    return [Verdict(**one) for one in written["verdicts"]] if is_current(written) else None
 
 
 def verdicts(scene: Scene, seed: int) -> list[Verdict]:

@@ -21,13 +21,12 @@ from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.eval.carrying import carry
 from jiggle_mj.eval.discrepancy_page import write_page
 from jiggle_mj.eval.score import Json, agreements
-from jiggle_mj.eval.tables import VERSION
 
 from jiggle_mj.episode import OnFrame, check_directory, clear_directory
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.recording import Recording
-from jiggle_mj.recording_declaration import file_metadata
+from jiggle_mj.recording_declaration import made_by
 from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import read_truth
 
@@ -71,7 +70,7 @@ def close_loop(
     gathered = gather(recording.declaration, recording.camera, recording, config=EstimatorConfig(), on_frame=on_frame)
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(gathered, library=library, say=say)
-        found = {VERSION: file_metadata()[VERSION]} | discrepancy(closed, gathered)
+        found = made_by() | discrepancy(closed, gathered)
     sheet = gathered.estimator.sheet
     if truth is not None:
         true = read_truth(truth)

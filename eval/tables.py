@@ -18,9 +18,7 @@ from jiggle_mj.scenes.observer import Sensing
 
 from jiggle_mj.episode import ESTIMATE, RESULT, settings
 from jiggle_mj.estimate_recording import read_estimate
-from jiggle_mj.recording_declaration import file_metadata
-
-VERSION = "version.jiggle-mj"
+from jiggle_mj.recording_declaration import made_by
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +114,7 @@ def finished(folder: Path, config: EstimatorConfig) -> Json | None:
     if not (folder / RESULT).exists():
         return None
     figures, made_with = read_result(folder / RESULT), read_estimate(folder / ESTIMATE).metadata
-    expected = settings(config) | {VERSION: file_metadata()[VERSION]}
+    expected = settings(config) | made_by()
     current = all(made_with.get(name) == value for name, value in expected.items())
     return figures if current and value(figures, ("detection", "n_attached")) is not None else None
 

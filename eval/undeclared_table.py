@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from jiggle_mj.eval.closing_the_loop import DISCREPANCY, close_loop
-from jiggle_mj.eval.tables import VERSION, carry_out
+from jiggle_mj.eval.tables import carry_out
 from jiggle_mj.scenes import Reference, Scene, load_scene, programme
 from jiggle_mj.scenes.anchor_disturbances import (
     AnchorBreak,
@@ -43,7 +43,7 @@ from jiggle_mj.scenes.world_disturbances import Bed, Friction, Gravity, ViscousD
 
 from jiggle_mj.episode import observe
 from jiggle_mj.mcap_files import truth_path
-from jiggle_mj.recording_declaration import file_metadata
+from jiggle_mj.recording_declaration import is_current
 
 LATE = 2.2
 """When what would else be in the rest shape begins: after the still frames, before the first grasp [s]."""
@@ -134,7 +134,7 @@ def measure(
 
 
 def _done(file: Path) -> bool:
-    return file.exists() and json.loads(file.read_text()).get(VERSION) == file_metadata()[VERSION]
+    return file.exists() and is_current(json.loads(file.read_text()))
 
 
 def _run(undeclared: str, seed: int, folder: Path) -> None:

@@ -5,6 +5,7 @@ A declared mesh travels as an npz attachment, all else as JSON in metadata recor
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -18,12 +19,23 @@ from jiggle_mj.observation import Declaration, DeclaredMesh
 
 METADATA, DECLARATION, MESH = "jiggle_mj", "jiggle_mj.declaration", "declared_mesh.npz"
 FORMAT = "1"
+VERSION = "version.jiggle-mj"
 
 
 def file_metadata() -> dict[str, str]:
     """What every file says of its making: the format, units and versions; no date."""
     packages = ("jiggle-mj", "numpy", "mcap", "foxglove-schemas-protobuf", "opencv-python-headless")
     return {"format": FORMAT, "units": "SI (m, N, s), time in ns"} | {f"version.{p}": version(p) for p in packages}
+
+
+def made_by() -> dict[str, str]:
+    """The version of this package, as `file_metadata` has it."""
+    return {VERSION: file_metadata()[VERSION]}
+
+
+def is_current(written: Mapping[str, object]) -> bool:
+    """Whether this version wrote something that holds what `made_by` says."""
+    return written.get(VERSION) == made_by()[VERSION]
 
 
 def identity(*parts: object) -> str:

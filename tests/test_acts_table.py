@@ -6,9 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jiggle_mj.eval import acts_table
 from jiggle_mj.eval.acts_table import Verdict, limit, markdown, measure, verdicts
-from jiggle_mj.eval.tables import VERSION
 from jiggle_mj.scenes import load_scene
 from tiny_scene import SCENE, scene_file
+
+from jiggle_mj.recording_declaration import VERSION
 
 GOOD, BAD = Verdict("Cut", True, 9.0), Verdict("Cut", False, -9.0)
 

@@ -7,10 +7,9 @@ import pytest
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.eval import undeclared_table
 from jiggle_mj.eval.closing_the_loop import DISCREPANCY
-from jiggle_mj.eval.tables import VERSION
 from jiggle_mj.eval.undeclared_table import INSIDE, NOTHING, OUTSIDE, markdown, measure, scene_with
 
-from jiggle_mj.recording_declaration import file_metadata
+from jiggle_mj.recording_declaration import VERSION, file_metadata
 
 
 def found(verdict: str, *names: str, after: float = 1e-3, also: tuple[str, ...] = ()) -> dict:

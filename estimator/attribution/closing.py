@@ -199,7 +199,7 @@ def _likely(problem: Problem, found: list[Score]) -> list[Score]:
     if not entering:
         return []
     first = entering[0]
-    confused = next(one for one in problem.sheet.library if one.name == first.name).confounded_with
+    confused = problem.sheet.effect(first.name).confounded_with
     near = [one for one in entering[LOOKED_AT:] if one.log_bayes_factor > COMPARED * first.log_bayes_factor]
     return entering[:LOOKED_AT] + [one for one in near if one.name in confused]
 
@@ -228,7 +228,7 @@ def _judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str],
 
 
 def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial], used: set[int]) -> Trial:
-    effect = next(one for one in problem.sheet.library if one.name == score.name)
+    effect = problem.sheet.effect(score.name)
     at = problem.sheet.place(effect.name, score.site)
     named = np.concatenate([*(problem.sheet.place(one.effect.name, one.score.site) for one in accepted), at])
     before, theta = stage.fitted, stage.fitted.point.theta.copy()

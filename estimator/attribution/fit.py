@@ -67,12 +67,11 @@ def fit(
     point: Point,
     parts: set[int],
     *,
-    passes: int = PASSES,
     say: Callable[[str], None] = lambda _: None,
 ) -> Fitted:
     """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some parts."""
     now, step = _reckoned(problem, named, point, problem.frames(parts))
-    for count in range(passes):
+    for count in range(PASSES):
         better = _shortened(problem, now, step)
         if better is None:
             break
@@ -87,7 +86,7 @@ def fit(
 
 def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
     """One more step from the end of a fit, with the frames of one part left out, by what is known there already."""
-    left = [k for k in fitted.glances if k not in problem.frames({part})]
+    left = [k for k in fitted.glances if problem.history.frames[k].part != part]
     glances, weights = {k: fitted.glances[k] for k in left}, {k: fitted.weights[k] for k in left}
     now, step = _found(problem, fitted.named, fitted.point, glances, weights)
     better = _shortened(problem, now, step)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.sheet import Sheet, closed_on, held_way, look, mean_of_held
+from jiggle_mj.estimator.attribution.sheet import Sheet, beyond_tool, look, mean_of_held
 from jiggle_mj.estimator.effects.mechanical import cosines, flat
 from jiggle_mj.estimator.effects.sheet_model import Moment
 from jiggle_mj.estimator.filters.evidence import Evidence
@@ -119,12 +119,10 @@ def glance(
     )
 
     def along(u):
-        changed = sheet.model(theta + directions @ u, moment, frame.way)
+        to = theta + directions @ u
+        changed = sheet.model(to, moment, frame.way)
         unbalanced = sheet.balance_of(changed.energy).unbalanced(x, s)
-        return unbalanced, look(changed, x, moment), tool_row(changed, theta + directions @ u)
-
-    def tool_row(changed, theta):
-        return held_way(changed, frame, closed_on(sheet, theta, frame, moment), x, moment) - changed.tool
+        return unbalanced, look(changed, x, moment), beyond_tool(sheet, changed, to, frame, moment, x)
 
     push, shown, taken = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
     held = mean_of_held(frame, shown)
@@ -132,7 +130,9 @@ def glance(
     e = metric.forces(frame.y - look(model, x, moment)) + linear.unbalanced
     columns = jnp.concatenate([push - apply(moved), fields, e[:, :, None]], axis=2)
     square = _whole(metric, columns)
-    tool = jnp.concatenate([taken, jnp.zeros((3, N_FIELDS)), tool_row(model, theta)[:, None]], axis=1)
+    tool = jnp.concatenate(
+        [taken, jnp.zeros((3, N_FIELDS)), beyond_tool(sheet, model, theta, frame, moment, x)[:, None]], axis=1
+    )
     return Glance(square=square, tool=jnp.where(moment.closed > 0, tool / TOOL_SD, 0.0)), metric
 
 
@@ -149,7 +149,7 @@ def misfit(
     model = sheet.model(theta, moment, frame.way)
     e = metric.forces(frame.y - look(model, x, moment))[:, :, None]
     against = metric.dot(jnp.concatenate([metric.fields, e], axis=2), e)[:, 0]
-    tool = (held_way(model, frame, closed_on(sheet, theta, frame, moment), x, moment) - model.tool) / TOOL_SD
+    tool = beyond_tool(sheet, model, theta, frame, moment, x) / TOOL_SD
     return Misfit(squared=against[-1], fields=against[:-1], tool=jnp.where(moment.closed > 0, tool, 0.0))
 
 

@@ -28,6 +28,10 @@ class Sheet(eqx.Module):
         """How many parameters the library has."""
         return sum(effect.size for effect in self.library)
 
+    def effect(self, name: str) -> Effect:
+        """The library's effect of a name."""
+        return next(one for one in self.library if one.name == name)
+
     def place(self, name: str, site: int | None = None) -> np.ndarray:
         """Where an effect's parameters are, at one site or at all."""
         start = 0
@@ -64,6 +68,18 @@ def closed_on(sheet: Sheet, theta: Float[Array, " p"], frame: ClosedFrame, momen
     model = sheet.model(theta, eqx.tree_at(lambda m: (m.time, m.closed), moment, then), frame.way)
     along = tangents(model.term(TriangleMembrane), moment.rest)
     return 2 * frame.closed_at - model.view(frame.closed_at, before=frame.closed_at, tangents=along)
+
+
+def beyond_tool(
+    sheet: Sheet,
+    model: SheetModel,
+    theta: Float[Array, " p"],
+    frame: ClosedFrame,
+    moment: Moment,
+    x: Float[Array, "n 3"],
+) -> Float[Array, " 3"]:
+    """By how much the held particles have gone further than the tool [m]."""
+    return held_way(model, frame, closed_on(sheet, theta, frame, moment), x, moment) - model.tool
 
 
 def held_way(

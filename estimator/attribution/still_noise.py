@@ -25,7 +25,6 @@ KEPT = 0.97
 """Share of the smooth part's variance that they hold; the rest counts as white."""
 FEWEST = 5
 """Still frames from which noise is measured."""
-
 JUMP = 4.0
 """Times the usual square of a difference, beyond which something else has happened between two frames."""
 
