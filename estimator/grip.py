@@ -1,14 +1,15 @@
 """Which particles the tweezer holds, and where it should have taken them.
 
-Held when the jaws close: the particles the recording names, or those within the radius of the tip. They move with the
-tip, give or take. The force on them is unknown, and so is that on their neighbours, since the true tissue's points do
-not sit where the mesh has its own: the filter gives neither a balance of forces.
+Held when the jaws close: the particles the recording names, or those within the radius of the tip. They move and turn
+with the tip, give or take. The force on them is unknown, and so is that on their neighbours, since the true tissue's
+points do not sit where the mesh has its own: the filter gives neither a balance of forces.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.observation import ToolState
@@ -24,6 +25,8 @@ class GripHold:
     """Positions of the particles when the jaws closed [m]."""
     tip: Float[np.ndarray, " 3"]
     """The tip when they closed [m]."""
+    turn: Rotation
+    """The tool's orientation when they closed."""
 
     @classmethod
     def close(
@@ -42,8 +45,16 @@ class GripHold:
                 f"{distance.min() * 1e3:.1f} mm from the nearest particle, and the jaws reach "
                 f"{tool.radius * 1e3:.1f} mm (check the tool pose, the camera pose, or the radius)."
             )
-        return cls(grasp=tool.grasp, held=held, closed_at=positions, tip=tool.position)
+        return cls(grasp=tool.grasp, held=held, closed_at=positions, tip=tool.position, turn=_orientation(tool))
+
+    def turned(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
+        """Where the held particles would be if they had only turned with the tool, about the tip, since then [m]."""
+        return self.tip + (_orientation(tool) * self.turn.inv()).apply(self.closed_at - self.tip)
 
     def expected(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
-        """Where the held particles are if they moved with the tip [m]; meaningless for the others."""
-        return self.closed_at + (tool.position - self.tip)
+        """Where the held particles are if they went with the tool [m]; meaningless for the others."""
+        return self.turned(tool) + (tool.position - self.tip)
+
+
+def _orientation(tool: ToolState) -> Rotation:
+    return Rotation.from_quat(tool.quat_wxyz, scalar_first=True)

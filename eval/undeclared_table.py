@@ -27,13 +27,23 @@ from jiggle_mj.scenes.anchor_disturbances import (
     PointPull,
 )
 from jiggle_mj.scenes.disturbance import Disturbance
-from jiggle_mj.scenes.report_disturbances import CameraBias, CameraDrift, DepthScale, PointSlip, ToolLatency, ToolScale
+from jiggle_mj.scenes.report_disturbances import (
+    CameraBias,
+    CameraDrift,
+    DepthScale,
+    ImageLatency,
+    Inertia,
+    PointSlip,
+    ToolLatency,
+    ToolScale,
+)
 from jiggle_mj.scenes.sheet_disturbances import (
     Anisotropy,
     Bending,
     Heterogeneity,
     Inclusion,
     MaterialDamping,
+    PreStrain,
     StrainStiffening,
     Stretch,
     TissueCreep,
@@ -47,7 +57,10 @@ from jiggle_mj.recording_declaration import is_current
 
 LATE = 2.2
 """When what would else be in the rest shape begins: after the still frames, before the first grasp [s]."""
-INSIDE: dict[str, tuple[str, Disturbance]] = {
+MOVING, SLOW = Inertia(magnitude=0.02), 0.03
+"""Frames that are taken while the tool has just stopped, and how fast it goes there [m/s]: that a report comes late
+shows in no sheet at rest."""
+INSIDE: dict[str, tuple[str, *tuple[Disturbance, ...]]] = {
     "gravity x 0.3": ("gravity", Gravity(magnitude=0.3, start=LATE)),
     "gravity leaning": ("gravity", Gravity(magnitude=1.0, tilt_deg=25, azimuth_deg=30, start=LATE)),
     "bed lower": ("bed", Bed(magnitude=-0.003, start=LATE)),
@@ -60,21 +73,23 @@ INSIDE: dict[str, tuple[str, Disturbance]] = {
     "anisotropy": ("anisotropy", Anisotropy(magnitude=3.0)),
     "stretch": ("stretch", Stretch(magnitude=2.5)),
     "bending": ("bending", Bending(magnitude=15)),
+    "pre-strain": ("pre_strain", PreStrain(magnitude=0.03, start=LATE)),
     "stiffening": ("strain_stiffening", StrainStiffening(magnitude=400)),
     "point pull": ("point_pull", PointPull(magnitude=8.0, at=(0.02, 0.02))),
     "anchor shift": ("anchor_shift", AnchorShift(magnitude=0.003, direction=(1.0, 0.3, 0.0), start=LATE)),
     "anchor creep": ("anchor_creep", AnchorCreep(magnitude=0.5)),
     "tool scale": ("tool_scale", ToolScale(magnitude=1.08)),
-    "tool latency": ("tool_latency", ToolLatency(magnitude=0.2)),
+    "tool latency": ("tool_latency", ToolLatency(magnitude=0.2), MOVING),
+    "image latency": ("image_latency", ImageLatency(magnitude=0.2), MOVING),
     "camera bias": ("camera_bias", CameraBias(magnitude=0.003, pitch_deg=1.0, start=LATE)),
     "camera drift": ("camera_drift", CameraDrift(magnitude=0.0003, roll_deg=0.05, start=LATE)),
     "depth scale": ("depth_scale", DepthScale(magnitude=1.03, start=LATE)),
     "point slip": ("point_slip", PointSlip(magnitude=0.0002)),
 }
-"""What is undeclared, the effect's name, and the disturbance."""
+"""What is undeclared, the effect's name, and the disturbances."""
 OUTSIDE: dict[str, Disturbance] = {
     "grasp slips": GraspSlip(magnitude=0.006),
-    "tissue yields": TissueYield(magnitude=0.05),
+    "tissue yields": TissueYield(magnitude=0.1),
     "anchors yield": AnchorYield(magnitude=0.0015),
     "anchors break": AnchorBreak(magnitude=0.006),
 }
@@ -97,7 +112,8 @@ def scene_with(undeclared: str, seed: int) -> Scene:
         increments=5,
         lowering=1,
     )
-    disturbance = OUTSIDE.get(undeclared) or (INSIDE[undeclared][1] if undeclared in INSIDE else None)
+    effect_and = INSIDE.get(undeclared, ("",))
+    disturbances = (OUTSIDE[undeclared],) if undeclared in OUTSIDE else effect_and[1:]
     return replace(
         arc,
         name=f"undeclared, {undeclared}",
@@ -106,10 +122,10 @@ def scene_with(undeclared: str, seed: int) -> Scene:
         tissue=replace(arc.tissue, spacing=6.5e-3, mesh="unstructured", seed=seed),
         bed=replace(arc.bed, friction=0.1),
         attachments=(replace(arc.attachments[0], width=0.0115, stiffness=2.0),),
-        tweezer=replace(arc.tweezer, radius=8e-3),
+        tweezer=replace(arc.tweezer, radius=8e-3, speed=SLOW if MOVING in disturbances else arc.tweezer.speed),
         programme=pulls,
         sensing=replace(arc.sensing, point_sd=1.5e-4, smooth_sd=1.5e-4, smooth_length=0.012),
-        disturbances=() if disturbance is None else (disturbance,),
+        disturbances=disturbances,
     )
 
 

@@ -29,6 +29,10 @@ class PointFiles:
     """Names or patterns, in the order of time; one .npz holds all frames."""
     key: str | None = None
     """Array of the .npz, shape (frames, points, 3)."""
+    times: str | None = None
+    """Array of the .npz, shape (frames,): when each was taken [s]; None for one every period."""
+    runs: str | None = None
+    """Array of the .npz, shape (frames,): whole numbers that change where another grasp begins; None for one grasp."""
     columns: tuple[int, ...] = (0, 1, 2)
     """Columns of x, y, z in a text file, from 0."""
     rest: int = 0
@@ -68,6 +72,22 @@ class GraspPath:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReportedTool:
+    """An instrument that reported where it was, at times of its own."""
+
+    tool: str
+    """Array of the .npz, shape (reports, 3), in the points' unit and frame."""
+    times: str
+    """Array of the .npz, shape (reports,), rising [s]."""
+    turns: str | None
+    """Array of the .npz, shape (reports, 4): quaternions, w first, in the points' frame; None where it never turns."""
+    rows: Rows
+    """Points that it holds."""
+    after: float
+    """How long each run shows the sheet at rest before the jaws count as closed [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """How far the sheet goes on beyond the measured points, along an axis; stations are world coordinates [m]."""
 
@@ -89,8 +109,8 @@ class MeasuredRecording:
     source: str
     unit: float
     """Metres in one unit of the data."""
-    period: int
-    """Time from frame to frame [ns]."""
+    period: int | None
+    """Time from frame to frame [ns]; None where the points have times."""
     noise_sd: float
     """Stated standard deviation of each coordinate [m]."""
     points: PointFiles
@@ -100,7 +120,7 @@ class MeasuredRecording:
     first_vertex: int
     """The number that means the first vertex in the faces."""
     extension: Extension | None
-    grasp: Rows | GraspPath
+    grasp: Rows | GraspPath | ReportedTool
     grasp_radius: float
     """[m]."""
     attached: Rows | float | None
@@ -132,14 +152,15 @@ def _recording(top: StrictTable) -> MeasuredRecording:
         raise RecordingError(f"{top.where} unit must be one of {', '.join(UNITS)}; got '{unit}'.")
     mesh, grasp = top.table("mesh", optional=True), top.table("grasp")
     truth, extend = top.table("truth", optional=True), mesh.table("extend", optional=True)
+    points = _points(top.table("points"))
     faces = mesh.take("faces", kinds.text, "none")
     recording = MeasuredRecording(
         name=top.take("name", kinds.text),
         source=top.take("source", kinds.text, ""),
         unit=UNITS[unit],
-        period=round(top.take("period", kinds.positive) * 1e9),
+        period=round(top.take("period", kinds.positive) * 1e9) if points.times is None else None,
         noise_sd=top.take("noise_sd", kinds.positive),
-        points=_points(top.table("points")),
+        points=points,
         frame=_frame(top.table("frame", optional=True)),
         faces=None if faces == "none" else faces,
         first_vertex=mesh.take("first_vertex", kinds.count, 0),
@@ -154,6 +175,8 @@ def _recording(top: StrictTable) -> MeasuredRecording:
         table.refuse_unknown()
     if isinstance(recording.attached, float) and recording.extension is None:
         raise RecordingError(f"{truth.where} attached_beyond needs [mesh.extend], whose axis it is counted along.")
+    if isinstance(recording.grasp, ReportedTool) and points.times is None:
+        raise RecordingError(f"{grasp.where} tool has times, so the points must have some: give [points] times.")
     return recording
 
 
@@ -162,6 +185,8 @@ def _points(table: StrictTable) -> PointFiles:
         files=table.take("files", kinds.texts),
         key=table.take("key", kinds.text, None),
         columns=tuple(table.take("columns", kinds.counts, (0, 1, 2))),
+        times=table.take("times", kinds.text, None),
+        runs=table.take("runs", kinds.text, None),
         rest=table.take("rest", kinds.count, 0),
     )
     table.refuse_unknown()
@@ -169,6 +194,12 @@ def _points(table: StrictTable) -> PointFiles:
         raise RecordingError(f"{table.where} needs at least one file, and three columns for x, y, z.")
     if (points.key is not None) != points.files[0].endswith(".npz"):
         raise RecordingError(f"{table.where} key names the array of an .npz, and only that; files are {points.files}.")
+    if points.key is None and (points.times or points.runs):
+        raise RecordingError(f"{table.where} times and runs name arrays of an .npz; files are {points.files}.")
+    if points.times and points.rest:
+        raise RecordingError(f"{table.where} rest must be 0 where frames have times; got {points.rest}.")
+    if points.runs and not points.times:
+        raise RecordingError(f"{table.where} runs needs times.")
     return points
 
 
@@ -194,15 +225,28 @@ def _extension(table: StrictTable) -> Extension:
     return extension
 
 
-def _grasp(table: StrictTable) -> Rows | GraspPath:
+def _grasp(table: StrictTable) -> Rows | GraspPath | ReportedTool:
+    if "tool" in table.values:
+        return ReportedTool(
+            tool=table.take("tool", kinds.text),
+            times=table.take("tool_times", kinds.text),
+            turns=table.take("tool_turns", kinds.text, None),
+            rows=_some_rows(table),
+            after=table.take("after", kinds.number, 0.0),
+        )
+    table.known |= {"tool", "tool_times", "tool_turns", "after"}
     if "start" in table.values:
         return GraspPath(
             start=np.array(table.take("start", kinds.vector)),
             direction=table.direction("direction"),
             step=table.take("step", kinds.number),
         )
-    rows = _rows(table, "rows")
     table.known |= {"start", "direction", "step"}
+    return _some_rows(table)
+
+
+def _some_rows(table: StrictTable) -> Rows:
+    rows = _rows(table, "rows")
     if rows is None:
         raise RecordingError(f"{table.where} needs rows or rows_file, or start, direction and step.")
     return rows

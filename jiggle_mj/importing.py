@@ -1,8 +1,8 @@
 """A folder of measured, tracked points becomes a recording, as its recording.toml says.
 
-The tool of a recording without one is where the grasped points are, or a straight path that the user states; the jaws
-are closed from the rest frame on, so that the tip's motion counts from there. What is known of the attachments goes
-into the truth file alone. One grasp, no images; does not smooth, fill or filter anything.
+Where the tool is, is in `import_tool`. The jaws are closed from the rest frame on, or in each run after the frames that
+show the sheet at rest, so that the tip's motion counts from there. What is known of the attachments goes into the truth
+file alone. No images; does not smooth, fill or filter the points.
 """
 
 import os
@@ -14,11 +14,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from jiggle_mj.errors import OutputError, RecordingError
-from jiggle_mj.import_declaration import Extension, GraspPath, MeasuredRecording, Rows, read_recording_toml
+from jiggle_mj.import_declaration import Extension, MeasuredRecording, Rows, read_recording_toml
+from jiggle_mj.import_tool import Tool
 from jiggle_mj.mcap_files import truth_path
 from jiggle_mj.mesh_checks import check_mesh
-from jiggle_mj.observation import DeclaredMesh, MeasuredPoints, Observation, ToolState
-from jiggle_mj.point_files import read_faces, read_frames, read_rows
+from jiggle_mj.observation import DeclaredMesh, MeasuredPoints, Observation
+from jiggle_mj.point_files import read_faces, read_frames, read_npz, read_rows
 from jiggle_mj.recording import RecordingWriter
 from jiggle_mj.recording_declaration import identity
 from jiggle_mj.sheet_triangulation import SheetPlane, extend, triangulate
@@ -75,8 +76,8 @@ def import_folder(
     frames, names, steps = _frames_in_world(folder, said)
     rest = frames[0]
     mesh = _declared_mesh(folder, said, rest)
-    held = np.empty(0, int) if isinstance(said.grasp, GraspPath) else read_rows(folder, said.grasp, len(rest), "grasp")
-    _check_held(rest, held, names[0])
+    clock = _clock(folder, said, len(frames))
+    tool = Tool.read(folder, said, rest, name=names[0], origin=clock.origin)
     name = identity(said.name, frames)
     truth = _truth(folder, said, rest, mesh, name)
     beside = truth_path(out)
@@ -84,7 +85,7 @@ def import_folder(
         if path.exists() and not overwrite:
             raise OutputError(f"{path} exists; choose another path, or allow it to be replaced (--overwrite).")
     skipped: list[tuple[str, str]] = []
-    n_frames, n_unseen = 0, 0
+    n_frames, n_unseen, before = 0, 0, 0
     with RecordingWriter(
         out,
         camera=None,
@@ -94,16 +95,23 @@ def import_folder(
     ) as writer:
         for number, (positions, file) in enumerate(zip(frames, names, strict=True)):
             unseen = ~np.isfinite(positions).all(axis=1)
-            if unseen.all() or (len(held) and not np.isfinite(positions[held] - rest[held]).all(axis=1).any()):
+            if unseen.all() or tool.unknown(positions):
                 skipped.append((file, "no finite point" if unseen.all() else "no grasped point seen"))
                 continue
-            tool = _tool(said, steps[number], positions, rest, held)
-            points = MeasuredPoints(positions=positions, track_id=np.arange(len(rest)), sd=said.noise_sd)
-            writer.write(Observation(index=n_frames, time=number * said.period, tool=tool, points=points))
-            n_frames, n_unseen = n_frames + 1, n_unseen + int(unseen.sum())
+            time, run, began = clock.times[number], clock.runs[number], clock.began[number]
+            writer.write(
+                Observation(
+                    index=n_frames,
+                    time=time,
+                    tool=tool.state(step=steps[number], time=time, run=run, began=began, positions=positions),
+                    reports=tool.reports.between(before, time) if tool.reports is not None else (),
+                    points=MeasuredPoints(positions=positions, track_id=np.arange(len(rest)), sd=said.noise_sd),
+                )
+            )
+            n_frames, n_unseen, before = n_frames + 1, n_unseen + int(unseen.sum()), time
     if truth is not None:
         write_truth(beside, truth, overwrite=overwrite)
-    n_held = int(mesh.held.sum()) if mesh is not None and mesh.held is not None else len(held)
+    n_held = int(mesh.held.sum()) if mesh is not None and mesh.held is not None else len(tool.held)
     return ImportSummary(
         recording=out,
         truth=None if truth is None else beside,
@@ -131,33 +139,40 @@ def _frames_in_world(folder: Path, said: MeasuredRecording) -> tuple[Float[np.nd
     return frames, names, [number - said.points.rest for number in order]
 
 
-def _check_held(rest: Float[np.ndarray, "n 3"], held: Int[np.ndarray, " h"], name: str) -> None:
-    if len(held) and not np.isfinite(rest[held]).all(axis=1).any():
+@dataclass(frozen=True, kw_only=True)
+class _Clock:
+    """Of each frame."""
+
+    times: list[int]
+    """[ns]."""
+    runs: list[int]
+    """From 1."""
+    began: list[int]
+    """When its run began [ns]."""
+    origin: float
+    """Time of the first frame where the data have times [s]."""
+
+
+def _clock(folder: Path, said: MeasuredRecording, count: int) -> _Clock:
+    points, seconds, numbers = said.points, np.arange(float(count)), np.zeros(count)
+    if points.times is not None:
+        seconds = read_npz(folder / points.files[0], points.times)
+    if points.runs is not None:
+        numbers = read_npz(folder / points.files[0], points.runs)
+    if seconds.shape != (count,) or numbers.shape != (count,) or not (np.diff(seconds) > 0).all():
         raise RecordingError(
-            f"the rest frame {name} shows none of the {len(held)} grasped points, so where the tool began is unknown; "
-            "choose another rest, or state the path in [grasp]."
+            f"[points] times must rise and have one entry for each of the {count} frames, and so must runs; they have "
+            f"shapes {seconds.shape} and {numbers.shape}."
         )
-
-
-def _tool(
-    said: MeasuredRecording,
-    step: int,
-    positions: Float[np.ndarray, "n 3"],
-    rest: Float[np.ndarray, "n 3"],
-    held: Int[np.ndarray, " h"],
-) -> ToolState:
-    """The tip: on the stated path, or at the grasped points' mean at rest plus the mean motion of those seen."""
-    if isinstance(said.grasp, GraspPath):
-        tip = said.grasp.start + step * said.grasp.step * said.grasp.direction
-    else:
-        tip = np.nanmean(rest[held], axis=0) + np.nanmean(positions[held] - rest[held], axis=0)
-    return ToolState(
-        position=tip,
-        quat_wxyz=np.array([1.0, 0, 0, 0]),
-        closed=True,
-        grasp=1,
-        radius=said.grasp_radius,
-        held_tracks=tuple(held.tolist()),
+    scale = 1e9 if said.period is None else said.period
+    times = [round((one - seconds[0]) * scale) for one in seconds]
+    first = np.append(True, np.diff(numbers) != 0)
+    started = np.maximum.accumulate(np.where(first, np.arange(count), 0))
+    return _Clock(
+        times=times,
+        runs=np.cumsum(first).tolist(),
+        began=[times[number] for number in started],
+        origin=float(seconds[0]),
     )
 
 
@@ -224,7 +239,9 @@ def _truth(
     if said.attached is None:
         return None
     if isinstance(said.attached, Rows):
-        known = np.isin(np.arange(len(rest)), read_rows(folder, said.attached, len(rest), "[truth]"))
+        nothing = said.attached.file is None and not said.attached.rows
+        rows = () if nothing else read_rows(folder, said.attached, len(rest), "[truth]")
+        known = np.isin(np.arange(len(rest)), rows)
         vertices, faces, attached = _truth_sheet(rest, known, mesh)
     else:
         assert mesh is not None and said.extension is not None

@@ -67,6 +67,18 @@ class ToolState:
     """Particles within this distance of the tip when the jaws close are held [m]."""
     held_tracks: tuple[int, ...] = ()
     """Track ids known to be held, for recordings that declare them; empty means 'by radius'."""
+    by_points: bool = False
+    """Whether the position is where the held points were seen, so that it says nothing of its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToolReport:
+    """Where the robot said that the tip was, between two observations."""
+
+    time: int
+    """As `Observation.time` [ns]."""
+    position: Float[np.ndarray, " 3"]
+    """World [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +112,8 @@ class Observation:
     time: int
     """Time from the recording's start [ns]."""
     tool: ToolState
+    reports: tuple[ToolReport, ...] = ()
+    """Of the tool since the observation before, where it reports more often than something is seen."""
     images: StereoPair | None = None
     points: MeasuredPoints | None = None
     events: tuple[Cut | Suture, ...] = ()

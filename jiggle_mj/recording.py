@@ -5,8 +5,10 @@ interpolate; which messages a file may hold is in `recording_contents`.
 """
 
 import os
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -14,13 +16,14 @@ from typing import Any, Self
 
 import numpy as np
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.mcap_files import McapOutput
-from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
+from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolReport, ToolState
 from jiggle_mj.recording_contents import (
     EVENT,
     GRASP,
@@ -97,6 +100,9 @@ class RecordingWriter:
             ValueError: images without a camera to explain them.
         """
         output, time = self._output, observation.time
+        for report in observation.reports:
+            at_report = replace(observation.tool, position=report.position)
+            output.message(POSE, report.time, pose_message(report.time, at_report))
         output.message(POSE, time, pose_message(time, observation.tool))
         output.json(GRASP, time, grasp_json(observation.tool), schema=GRASP_SCHEMA)
         for event in observation.events:
@@ -146,6 +152,7 @@ class Recording:
             grasp=stamped[GRASP],
             tolerance=tolerance_ns,
         )
+        self._poses = sorted(stamped[POSE])
         self._origin = 0 if self.metadata else self._moments[0].stamp
 
     @classmethod
@@ -179,6 +186,7 @@ class Recording:
         """Usable observations in file order."""
         self.skipped = []
         latest: int | None = None
+        told: Stamped | None = None
         coming = deque(self._contents.events)
         for index, (moment, messages) in enumerate(self._messages()):
             try:
@@ -192,7 +200,8 @@ class Recording:
             events = []
             while coming and coming[0][0] <= moment.stamp + self._tolerance:
                 events.append(coming.popleft()[1])
-            yield replace(observation, events=tuple(events))
+            yield replace(observation, events=tuple(events), reports=self._reports(told, moment.pose))
+            told = moment.pose
 
     def _messages(self) -> Iterator[tuple[Moment, dict[str, Any]]]:
         """Each moment with its images and points, still encoded; keeps only what a coming moment needs."""
@@ -250,6 +259,21 @@ class Recording:
         track = columns["track_id"].astype(np.int64) if "track_id" in columns else None
         return MeasuredPoints(positions=positions, track_id=track, **known)
 
+    def _reports(self, after: Stamped | None, until: Stamped | None) -> tuple[ToolReport, ...]:
+        """What the tool said between the poses of two observations, poses that are none left out."""
+        if until is None:
+            return ()
+        reports, begin = [], 0 if after is None else bisect_right(self._poses, after)
+        for one in self._poses[begin : bisect_left(self._poses, until)]:
+            with suppress(RecordingError):
+                tip = self._tip(self._contents.poses[one.ordinal])[:3, 3]
+                reports.append(ToolReport(time=one.stamp - self._origin, position=tip))
+        return tuple(reports)
+
+    def _tip(self, pose: PoseInFrame) -> Float[np.ndarray, "4 4"]:
+        """In the world."""
+        return self._contents.frames.T_world(pose.frame_id, POSE) @ parse_transform(pose.pose)
+
     def _tool(self, moment: Moment) -> ToolState:
         if moment.pose is None or moment.grasp is None:
             raise RecordingError("no tool pose or grasp has come yet")
@@ -258,7 +282,7 @@ class Recording:
             raise RecordingError(f"the latest tool pose is {age / 1e6:g} ms old")
         pose = self._contents.poses[moment.pose.ordinal]
         T = self._contents.frames.T_world(pose.frame_id, POSE)
-        T_world_tip = T @ parse_transform(pose.pose)
+        T_world_tip = self._tip(pose)
         stated = pose.pose.orientation
         quat_wxyz = np.array([stated.w, stated.x, stated.y, stated.z])
         if not (quat_wxyz.any() and np.array_equal(T, np.eye(4))):

@@ -40,6 +40,7 @@ GRASP_SCHEMA: dict[str, object] = {
         "grasp": {"type": "integer", "description": "number of the current or last grasp, from 1; 0 before the first"},
         "radius": {"type": "number", "description": "tissue within this distance of the tip is held [m]"},
         "held_tracks": {"type": "array", "items": {"type": "integer"}, "description": "track ids known to be held"},
+        "by_points": {"type": "boolean", "description": "whether the pose is where the held points were seen"},
     },
     "required": ["closed", "grasp", "radius"],
 }
@@ -202,16 +203,17 @@ def pose_message(time: int, tool: ToolState) -> PoseInFrame:
 
 def grasp_json(tool: ToolState) -> dict[str, object]:
     """The jaws' state, after `GRASP_SCHEMA`."""
-    return {
+    said: dict[str, object] = {
         "closed": bool(tool.closed),
         "grasp": int(tool.grasp),
         "radius": float(tool.radius),
         "held_tracks": [int(track) for track in tool.held_tracks],
     }
+    return said | {"by_points": True} if tool.by_points else said
 
 
 def parse_grasp(data: bytes) -> dict[str, Any]:
-    """The fields closed, grasp, radius and held_tracks of a grasp message.
+    """The fields of a grasp message.
 
     Raises:
         RecordingError: not JSON, or a field missing or of the wrong kind.
@@ -225,10 +227,12 @@ def parse_grasp(data: bytes) -> dict[str, Any]:
             "grasp": int(value["grasp"]),
             "radius": float(value["radius"]),
             "held_tracks": tuple(int(track) for track in value.get("held_tracks", ())),
+            "by_points": bool(value.get("by_points", False)),
         }
     except (KeyError, TypeError, ValueError) as failure:
         raise RecordingError(
-            f"/tool/grasp must be JSON {{closed, grasp, radius, held_tracks}}; got {data[:80]!r} ({failure!r})."
+            "/tool/grasp must be JSON {closed, grasp, radius}, and held_tracks and by_points where they are known; "
+            f"got {data[:80]!r} ({failure!r})."
         ) from failure
 
 

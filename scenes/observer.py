@@ -19,7 +19,7 @@ from jiggle_mj.scenes.simulation import Simulation
 from jiggle_mj.scenes.stereo import StereoRenderer, place_cameras, stereo_camera
 
 from jiggle_mj.errors import SceneError
-from jiggle_mj.observation import MeasuredPoints, StereoPair
+from jiggle_mj.observation import MeasuredPoints, StereoPair, ToolReport
 
 Sensing = Literal["stereo", "points", "particles", "cloud"]
 SENSING: tuple[Sensing, ...] = get_args(Sensing)
@@ -52,6 +52,10 @@ class Faults:
     """Share of frames that show what the one before showed."""
     images: list[Callable[[StereoPair, np.random.Generator], StereoPair]] = field(default_factory=list)
     """What happens to rendered images, one after the other."""
+
+
+REPORTED = 0.04
+"""From one of the tool's reports to the next [s]."""
 
 
 class Observer:
@@ -98,6 +102,9 @@ class Observer:
         self._seen_at = 0.0
         self._closed_at = simulation.jaws.tip
         self._last: View | None = None
+        self._reports: list[ToolReport] = []
+        self._reported_at = simulation.data.time
+        simulation.rules.append(self._report)
 
     def remember(self, longest: float) -> None:
         """Keep the past, as far back as `longest` [s]."""
@@ -129,6 +136,18 @@ class Observer:
         late = self._history is not None and faults.tool_delay > 0
         true = self._history.tip_before(faults.tool_delay) if late and self._history else self.simulation.jaws.tip
         return self._closed_at + faults.tool_scale * (true - self._closed_at) + faults.tool_offset
+
+    def reports(self) -> tuple[ToolReport, ...]:
+        """What the tool has said since this was last asked, now left out."""
+        now = round(self.simulation.data.time * 1e9)
+        told, self._reports = tuple(one for one in self._reports if one.time < now), []
+        return told
+
+    def _report(self) -> None:
+        now = self.simulation.data.time
+        if now > self._reported_at + REPORTED - self.simulation.model.opt.timestep / 2:
+            self._reports.append(ToolReport(time=round(now * 1e9), position=self.tip()))
+            self._reported_at = now
 
     def look(self) -> View | None:
         """What is seen now; None where the frame was lost."""

@@ -17,7 +17,7 @@ from jiggle_mj.scenes.observer import SENSING, Observer, Sensing
 from jiggle_mj.scenes.procedure import carry_out
 from jiggle_mj.scenes.scene import Scene
 from jiggle_mj.scenes.scene_file import scene_table
-from jiggle_mj.scenes.simulation import Simulation
+from jiggle_mj.scenes.simulation import MAX_STEPS, Simulation
 from jiggle_mj.scenes.tissue import TIMESTEP
 
 from jiggle_mj.camera import StereoCamera
@@ -107,7 +107,7 @@ class Reference:
                 pass
             case _:
                 raise ActionError(f"step takes a Grasp, Move, Release, Wait, Cut or Suture; got {action!r}.")
-        settled = self._wait() if isinstance(action, Wait) else self._settle()
+        settled = self._wait() if isinstance(action, Wait) else self._settle(hasty=isinstance(action, Move))
         seen = self._observer.look()
         if seen is None:
             return Observation(index=self._index + 1, time=self._time, tool=self._tool(), events=self._events)
@@ -118,7 +118,13 @@ class Reference:
         images, points = seen
         events, self._events = self._events, ()
         return Observation(
-            index=self._index, time=self._time, tool=self._tool(), images=images, points=points, events=events
+            index=self._index,
+            time=self._time,
+            tool=self._tool(),
+            reports=self._observer.reports(),
+            images=images,
+            points=points,
+            events=events,
         )
 
     def truth_frame(self) -> TruthFrame:
@@ -207,8 +213,8 @@ class Reference:
         """The point, or where a tip on its way down there meets the bed."""
         return np.array([*point[:2], max(point[2], 0.0)]) if self.scene.bed.present else point
 
-    def _settle(self) -> bool:
-        settled = self._simulation.settle()
+    def _settle(self, *, hasty: bool = False) -> bool:
+        settled = self._simulation.settle(steps=self._simulation.patience if hasty else MAX_STEPS)
         mujoco.mj_forward(self._simulation.model, self._simulation.data)
         return settled
 

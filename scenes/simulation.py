@@ -56,10 +56,10 @@ class Simulation:
         self.rules: list[Callable[[], None]] = []
         """Called after each step."""
         self.patience = MAX_STEPS
-        """Steps after which a frame is taken, at rest or not."""
+        """Steps after a move after which a frame is taken, at rest or not."""
         mine = [one for one in scene.disturbances if isinstance(one, TissueDisturbance)]
         self._coming = [one for one in mine if one.start == 0]
-        self.settle(speed=AT_REST, steps=MAX_STEPS)
+        self.settle(speed=AT_REST)
         self.data.time = 0.0
         self._coming = sorted((one for one in mine if one.start > 0), key=lambda one: one.start)
 
@@ -78,9 +78,9 @@ class Simulation:
         self.jaws.slip()
         self.anchors.follow()
 
-    def settle(self, *, speed: float = SETTLED, steps: int | None = None) -> bool:
-        """Step until every coordinate is slower than `speed` [m/s]; False if `steps` or `patience` came first."""
-        for _ in range(self.patience if steps is None else steps):
+    def settle(self, *, speed: float = SETTLED, steps: int = MAX_STEPS) -> bool:
+        """Step until every coordinate is slower than `speed` [m/s]; False if `steps` came first."""
+        for _ in range(steps):
             self.step()
             if np.abs(self.data.qvel).max() < speed:
                 return True

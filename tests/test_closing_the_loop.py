@@ -174,7 +174,7 @@ def test_noise_is_measured_from_still_frames_with_its_smooth_part():
     apart = np.sum((rest[:, None] - rest[None]) ** 2, axis=2)
     root = np.linalg.cholesky(np.exp(-0.5 * apart / 0.012**2) + 1e-9 * np.eye(len(rest)))
     smooth = 2e-4 * np.einsum("ij,tjk->tik", root, draw.normal(size=(40, len(rest), 3)))
-    noise = measure(rest[None] + smooth + 1e-4 * draw.normal(size=(40, len(rest), 3)), rest)
+    noise = measure([rest[None] + smooth + 1e-4 * draw.normal(size=(40, len(rest), 3))], rest)
     assert noise is not None
     assert noise.sd == pytest.approx(1e-4, rel=0.25)
     assert noise.smooth_sd == pytest.approx(2e-4, rel=0.25)
@@ -188,7 +188,7 @@ def test_a_jump_between_still_frames_is_no_noise():
     draw, rest = np.random.default_rng(0), sheet().rest
     still = rest[None] + 1e-4 * draw.normal(size=(20, len(rest), 3))
     jumped = still + np.where(np.arange(20) < 17, 0.0, 3e-3)[:, None, None]
-    plain, noise = measure(still, rest), measure(jumped, rest)
+    plain, noise = measure([still], rest), measure([jumped], rest)
     assert plain is not None and noise is not None
     assert (noise.sd, noise.smooth_sd) == pytest.approx((plain.sd, plain.smooth_sd), abs=5e-6)
 
@@ -201,19 +201,19 @@ def test_where_the_jaws_closed_is_seen_by_the_moved_camera_too(light):
         k, shift = 2, jnp.array([1e-3, -2e-3, 3e-3, 0.0, 0.0, 0.0])
         states = light[0].stages[0].fitted.point.states
         frame, moment = problem.history.frames[k].frame, problem.history.moment(k, states)
-        moved = dataclasses.replace(frame, y=frame.y + shift[None, :3], closed_at=frame.closed_at + shift[None, :3])
+        moved = dataclasses.replace(frame, y=frame.y + shift[None, :3], turned=frame.turned + shift[None, :3])
         closed = closed_on(sheet, shift, moved, moment)
-        np.testing.assert_allclose(closed, frame.closed_at, atol=1e-12)
+        np.testing.assert_allclose(closed, frame.turned, atol=1e-12)
         x, nothing = jnp.asarray(states[k]), jnp.zeros(6)
         ways = [
-            held_way(sheet.model(theta, moment, one.way), one, closed_on(sheet, theta, one, moment), x, moment)
+            held_way(sheet.model(theta, moment, one.way), one, closed_on(sheet, theta, one, moment), x)
             for theta, one in ((nothing, frame), (shift, moved))
         ]
         np.testing.assert_allclose(*ways, atol=1e-12)
 
 
 def test_without_still_frames_the_noise_is_assumed_and_said_to_be():
-    assert measure(np.zeros((2, 5, 3)), np.zeros((5, 3))) is None
+    assert measure([np.zeros((2, 5, 3))], np.zeros((5, 3))) is None
     observations = [one for one in seen(1.0) if one.tool.closed][:6]
     rest = dataclasses.replace(observations[0], tool=dataclasses.replace(observations[0].tool, closed=False, grasp=0))
     rest = dataclasses.replace(rest, points=seen(1.0)[0].points)

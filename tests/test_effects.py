@@ -57,7 +57,7 @@ def shown(effect: Effect, plain: SheetModel, moment: Moment):
     @jax.jit
     def all_of(theta):
         model = effect.acts(plain, theta, moment)
-        seen = model.view(x, before=moment.before, tangents=tangents(membrane, x))
+        seen = model.view(x, tangents=tangents(membrane, x))
         parts = (
             model.energy.internal_gradient(x) / force,
             seen / length,
@@ -124,7 +124,7 @@ def test_turning_the_camera_is_a_rotation_about_the_middle(plain, moment):
         x, membrane = moment.now, plain.term(TriangleMembrane)
         theta = jnp.array([1e-3, 0.0, 0.0, 0.0, 0.0, np.pi / 2])
         view = EFFECTS["camera_bias"].acts(plain, theta, moment).view
-        seen = np.asarray(view(x, before=moment.before, tangents=tangents(membrane, x)))
+        seen = np.asarray(view(x, tangents=tangents(membrane, x)))
         middle = sheet().rest.mean(axis=0)
         off = np.asarray(x) - middle
         np.testing.assert_allclose(seen - middle, np.column_stack([1e-3 - off[:, 1], off[:, 0], off[:, 2]]), atol=1e-12)

@@ -91,7 +91,7 @@ def test_a_folder_becomes_a_recording_and_a_truth_apart(tmp_path):
     assert recording.declaration.mesh is None
     for observation in seen:
         state = observation.tool
-        assert state.closed and state.grasp == 1 and state.held_tracks == (0, 1)
+        assert state.closed and state.grasp == 1 and state.held_tracks == (0, 1) and state.by_points
         np.testing.assert_allclose(state.position, observation.points.positions[:2].mean(axis=0), atol=ROUNDING)
     truth = read_truth(summary.truth)
     assert summary.truth == truth_path(summary.recording) and summary.n_attached == 2 and truth.frames == ()
@@ -270,7 +270,7 @@ def test_extension_on_one_side_leaves_the_other_alone():
         (
             "rows = [0, 1]",
             "rows = [0, 1]\ntip = 3",
-            r"\[grasp\] has the unknown key 'tip'; known: direction, radius",
+            r"\[grasp\] has the unknown key 'tip'; known: after, direction, radius",
         ),
         ("bed = false", "bed = 0", r"\[declaration\] bed must be true or false; got 0"),
         ("bed = false", "youngs = 3.0", r"\[declaration\] has the unknown key 'youngs'; known: areal_density"),
@@ -380,6 +380,87 @@ def test_a_good_mesh_passes_and_each_fault_is_named():
     for vertices, faces, message in cases:
         with pytest.raises(MeshError, match=message):
             check_mesh(vertices, faces)
+
+
+REPORTED = """
+name = "runs"
+unit = "mm"
+noise_sd = 1e-4
+[points]
+files = ["d.npz"]
+key = "p"
+times = "t"
+runs = "r"
+[frame]
+rotation = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+[grasp]
+rows = [0, 1]
+tool = "tip"
+tool_times = "at"
+tool_turns = "turn"
+after = 0.5
+[truth]
+attached_rows = []
+"""
+
+
+def reported_folder(tmp_path: Path, *, toml: str = REPORTED, **arrays) -> Path:
+    """Two runs of three frames at 2 Hz, and a tool that goes along x at 10 mm/s from the start, turning about z."""
+    where = tmp_path / "data"
+    where.mkdir()
+    at = np.arange(0, 4.01, 0.2)
+    turns = np.column_stack([np.cos(0.05 * at), 0 * at, 0 * at, np.sin(0.05 * at)])
+    given = {
+        "p": np.tile(grid(), (6, 1, 1)),
+        "t": 7.0 + np.array([0.0, 0.5, 1.0, 2.0, 2.5, 3.0]),
+        "r": np.array([1, 1, 1, 2, 2, 2]),
+        "tip": np.column_stack([10 * at, 0 * at, 0 * at]),
+        "at": 7.0 + at,
+        "turn": turns,
+    }
+    np.savez(where / "d.npz", **(given | arrays))
+    (where / "recording.toml").write_text(toml)
+    return where
+
+
+def test_runs_with_a_tool_that_reported_become_grasps(tmp_path):
+    """The world is turned by 90 degrees about z: what goes along x as given goes along y."""
+    summary, recording = bring_in(reported_folder(tmp_path))
+    seen = list(recording)
+    assert summary.n_attached == 0
+    assert [round(one.time / 1e9, 6) for one in seen] == [0, 0.5, 1, 2, 2.5, 3]
+    assert [one.tool.closed for one in seen] == [False, True, True, False, True, True]
+    assert [one.tool.grasp for one in seen] == [0, 1, 1, 1, 2, 2]
+    for one in seen:
+        time = one.time / 1e9
+        np.testing.assert_allclose(one.tool.position, [0, 0.01 * time, 0], atol=1e-12)
+        angle = 2 * np.arctan2(one.tool.quat_wxyz[3], one.tool.quat_wxyz[0])
+        assert angle == pytest.approx(np.pi / 2 + 0.1 * time, abs=1e-9)
+        assert not one.tool.by_points
+    told = [round(report.time / 1e9, 6) for report in seen[3].reports]
+    assert told == [1.2, 1.4, 1.6, 1.8]
+    np.testing.assert_allclose(seen[3].reports[0].position, [0, 0.012, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "arrays", "says"),
+    [
+        (("after = 0.5", 'after = "soon"'), {}, "after must be a number"),
+        (('times = "t"\nruns', "runs"), {}, "runs needs times"),
+        (('times = "t"\nruns = "r"', ""), {}, "lacks the key 'period'"),
+        (('times = "t"\nruns = "r"', "rest = 1"), {}, "lacks the key 'period'"),
+        (('runs = "r"', "rest = 1"), {}, "rest must be 0 where frames have times; got 1"),
+        (('times = "t"', 'times = "u"'), {}, "has no array 'u'"),
+        (("", ""), {"t": np.zeros(6)}, "times must rise"),
+        (("", ""), {"r": np.zeros(5)}, "one entry for each of the 6 frames"),
+        (("", ""), {"at": np.zeros(21)}, r"at \(reports,\), rising"),
+        (("", ""), {"turn": np.ones((21, 3))}, r"turn must have shape \(21, 4\), w first"),
+    ],
+)
+def test_what_is_wrong_with_runs_and_reports_is_said(tmp_path, changed, arrays, says):
+    where = reported_folder(tmp_path, toml=REPORTED.replace(*changed) if changed[0] else REPORTED, **arrays)
+    with pytest.raises(RecordingError, match=says):
+        bring_in(where)
 
 
 def measured(name: str) -> Path:

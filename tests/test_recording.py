@@ -23,6 +23,7 @@ from jiggle_mj.observation import (
     MeasuredPoints,
     Observation,
     StereoPair,
+    ToolReport,
     ToolState,
 )
 from jiggle_mj.recording import Recording, RecordingWriter
@@ -78,7 +79,11 @@ def observations(n: int = 3) -> list[Observation]:
             Observation(
                 index=index,
                 time=index * 125 * MS + (index > 0),
-                tool=tool(x=0.1 + index, held=(3, 1)),
+                tool=replace(tool(x=0.1 + index, held=(3, 1)), by_points=index == 1),
+                reports=tuple(
+                    ToolReport(time=index * 125 * MS - late * MS, position=generator.normal(size=3))
+                    for late in ((80, 40) if index == 2 else ())
+                ),
                 images=StereoPair(left=image(2 * index), right=image(2 * index + 1)),
                 points=MeasuredPoints(positions=positions, track_id=np.array([4, 2, 0, 9, -1]), sd=1 / 3e4),
             )
@@ -107,6 +112,9 @@ def assert_same(one: Observation, other: Observation) -> None:
     assert (one.index, one.time) == (other.index, other.time)
     for f in fields(ToolState):
         np.testing.assert_array_equal(getattr(one.tool, f.name), getattr(other.tool, f.name))
+    assert [report.time for report in one.reports] == [report.time for report in other.reports]
+    for report, same in zip(one.reports, other.reports, strict=True):
+        np.testing.assert_array_equal(report.position, same.position)
     for side in ("left", "right"):
         np.testing.assert_array_equal(getattr(one.images, side), getattr(other.images, side))
     np.testing.assert_array_equal(one.points.positions, other.points.positions)
@@ -209,7 +217,7 @@ def test_foxglove_fields_are_filled_and_the_file_is_sound(tmp_path):
     with open(path, "rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
-        assert summary.statistics.message_count == 3 + 3 * 5 == sum(c[1] for c in counts(summary))
+        assert summary.statistics.message_count == 3 + 3 * 5 + 2 == sum(c[1] for c in counts(summary))
         assert len(summary.chunk_indexes) == 4 and len(summary.metadata_indexes) == 2
         assert {channel.topic for channel in summary.channels.values()} == {
             *(LEFT, RIGHT, LEFT_INFO, RIGHT_INFO, TF, POSE, GRASP, POINTS)
@@ -625,11 +633,30 @@ def test_a_cloud_without_z_is_skipped_by_name(tmp_path):
     assert read_all(bag.output.path) == ([], [(0, "/tissue/points lacks the fields ['z']; it has ['x', 'y'].")])
 
 
+def test_what_the_tool_said_while_a_frame_could_not_be_used_goes_to_the_next_one(tmp_path):
+    bag = Bag(tmp_path / "run.mcap")
+    for time, x in ((0, 0.0), (40, 1.0), (100, 2.0), (140, np.nan), (160, 3.0), (200, 4.0)):
+        state = replace(tool(), position=np.array([x, 0.0, 0.0]))
+        bag.tool(time * MS, state)
+        if time in (0, 200):
+            bag.points(time * MS)
+        elif time == 100:
+            bag.points(time * MS, sd=np.array([1.0, 2.0, 3.0]))
+    bag.output.close()
+    seen, skipped = read_all(bag.output.path)
+    assert [index for index, _ in skipped] == [1]
+    assert [(report.time, report.position[0]) for report in seen[1].reports] == [
+        (40 * MS, 1.0),
+        (100 * MS, 2.0),
+        (160 * MS, 3.0),
+    ]
+
+
 def test_a_grasp_that_is_no_grasp_is_refused(tmp_path):
     bag = Bag(tmp_path / "run.mcap")
     bag.output.json(GRASP, 0, {"closed": 1}, schema=GRASP_SCHEMA)
     bag.output.close()
-    with pytest.raises(RecordingError, match=r"must be JSON \{closed, grasp, radius, held_tracks\}"):
+    with pytest.raises(RecordingError, match=r"must be JSON \{closed, grasp, radius\}, and held_tracks"):
         Recording.open(bag.output.path)
 
 

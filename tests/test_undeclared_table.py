@@ -30,12 +30,12 @@ def test_scenes_differ_by_what_is_undeclared_alone_and_keep_it_secret():
     assert plain.disturbances == ()
     for name in (*INSIDE, *OUTSIDE):
         scene = scene_with(name, 0)
-        assert len(scene.disturbances) == 1 and scene.secret and scene.attachments == plain.attachments
+        assert scene.disturbances and scene.secret and scene.attachments == plain.attachments
 
 
 def test_what_is_inside_is_in_the_library_and_what_is_outside_is_not():
     names = {effect.name for effect in LIBRARY}
-    assert {effect for effect, _ in INSIDE.values()} <= names
+    assert {effect for effect, *_ in INSIDE.values()} <= names
     assert (
         not {undeclared_table.scene_with(name, 0).disturbances[0].__class__.__name__.lower() for name in OUTSIDE}
         & names

@@ -24,10 +24,14 @@ class ClosedFrame(eqx.Module):
     held: Bool[Array, " n"]
     loaded: Bool[Array, " n"]
     """Near the grip, where forces are not reckoned with."""
-    closed_at: Float[Array, "n 3"]
-    """Where the jaws closed on the held particles [m]."""
+    turned: Float[Array, "n 3"]
+    """Where the jaws closed on the held particles, turned about the tip as the tool has turned since [m]."""
     way: Float[Array, " 3"]
     """How far the tool says that it has gone since [m]."""
+    by_points: Bool[Array, ""]
+    """Whether that is but where the held particles were seen."""
+    held_sd: Float[Array, ""]
+    """Of the mean of what is held, by the noise of what is seen [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +49,8 @@ class Timed:
     """Since the jaws closed [s]."""
     state: Float[np.ndarray, "n 3"]
     """As the filter found it [m]."""
+    reports: tuple[tuple[float, Float[np.ndarray, " 3"]], ...]
+    """Times [s], as `time`, and the tool's way [m] by its reports since the frame before and in this one."""
 
 
 class History:
@@ -57,8 +63,9 @@ class History:
         grasps = [one.grasp for one in frames]
         same = np.array([False] + [a == b for a, b in pairwise(grasps)])
         self._follows, self._last = same, np.where(same, np.roll(self._times, 1), self._times)
-        longest = max(grasps.count(grasp) for grasp in set(grasps))
-        self._reports = {grasp: self._reported(grasp, longest) for grasp in set(grasps)}
+        told = {grasp: [told for one in frames if one.grasp == grasp for told in one.reports] for grasp in set(grasps)}
+        longest = max(len(one) for one in told.values())
+        self._reports = {grasp: _padded(one, longest) for grasp, one in told.items()}
 
     def moment(self, k: int, states: Float[np.ndarray, "frames n 3"]) -> Moment:
         """What an effect may know of frame k."""
@@ -82,9 +89,11 @@ class History:
             ended=jnp.asarray(self._times),
         )
 
-    def _reported(self, grasp: int, longest: int) -> tuple[Float[Array, " r"], Float[Array, "r 3"]]:
-        mine = [one for one in self.frames if one.grasp == grasp]
-        times, ways = [one.time for one in mine], [np.asarray(one.frame.way) for one in mine]
-        times += [times[-1] + k for k in range(1, longest - len(mine) + 1)]
-        ways += [ways[-1]] * (longest - len(mine))
-        return jnp.asarray(times), jnp.asarray(ways)
+
+def _padded(
+    told: list[tuple[float, Float[np.ndarray, " 3"]]], length: int
+) -> tuple[Float[Array, " r"], Float[Array, "r 3"]]:
+    """As long a series; after the last report the tool stood."""
+    last, way = told[-1]
+    told = told + [(last + k, way) for k in range(1, length - len(told) + 1)]
+    return jnp.asarray([time for time, _ in told]), jnp.asarray(np.stack([way for _, way in told]))

@@ -14,7 +14,7 @@ from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, cost_under, fi
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
-from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.scores import Score, occam, scores
 from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.effects import LIBRARY, Effect
@@ -152,7 +152,7 @@ def close_the_loop(
         before = foretell(problem, stages[0].fitted, spare)
         reported = before, foretell(problem, stages[-1].fitted, spare) if accepted else before
     return Closed(
-        verdict=_verdict(accepted, rivals, stages[-1]),
+        verdict=_verdict(accepted, rivals, stages[-1], reported),
         accepted=accepted,
         rivals=rivals,
         refused=refused,
@@ -183,7 +183,8 @@ def _trials(
     problem: Problem, stage: Stage, accepted: list[Trial], used: set[int], say: Callable[[str], None]
 ) -> list[Trial]:
     """The likeliest effects, fitted, the best first, as far as they are worth a look."""
-    found = scores(problem, stage.fitted)
+    found = [_where_natural(problem, stage, one) for one in scores(problem, stage.fitted)]
+    found.sort(key=lambda one: -one.log_bayes_factor)
     stage.scores.extend(found)
     say("scores: " + ", ".join(f"{one.name} {one.log_bayes_factor:.1f}" for one in found[:6]))
     trials = [_fitted(problem, stage, one, accepted, used) for one in _likely(problem, found)]
@@ -191,6 +192,26 @@ def _trials(
         say(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
     trials = [one for one in trials if one.log_bayes_factor > ENTER]
     return sorted(trials, key=lambda one: (not one.sensible, -one.log_bayes_factor))
+
+
+def _where_natural(problem: Problem, stage: Stage, score: Score) -> Score:
+    """An effect's score, or that of what it explains at its natural size, where that is more."""
+    effect, before = problem.sheet.effect(score.name), stage.fitted
+    if effect.natural is None:
+        return score
+    theta = np.array(effect.natural)
+    point = _along(problem, before, problem.sheet.place(effect.name, score.site), theta)
+    cost = cost_under(problem, before.weights, before.glances, point)
+    prior = np.sum((theta / np.asarray(effect.prior_sd)) ** 2)
+    gain = (before.cost - cost - prior) / 2
+    return score if gain <= score.log_bayes_factor else replace(score, log_bayes_factor=gain, theta=theta)
+
+
+def _along(problem: Problem, fitted: Fitted, at: np.ndarray, theta: np.ndarray) -> Point:
+    """A fit's point with other values of some parameters."""
+    changed = fitted.point.theta.copy()
+    changed[at] = theta
+    return start(problem, changed, fitted.point.s, fitted.point.states, list(fitted.glances))
 
 
 def _likely(problem: Problem, found: list[Score]) -> list[Score]:
@@ -231,10 +252,9 @@ def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial],
     effect = problem.sheet.effect(score.name)
     at = problem.sheet.place(effect.name, score.site)
     named = np.concatenate([*(problem.sheet.place(one.effect.name, one.score.site) for one in accepted), at])
-    before, theta = stage.fitted, stage.fitted.point.theta.copy()
-    limit = START * problem.prior_sd[at]
-    theta[at] = np.clip(theta[at] + score.theta, 0.0 if effect.non_negative else -limit, limit)
-    point = start(problem, theta, before.point.s, before.point.states, problem.frames(used))
+    before, limit = stage.fitted, START * problem.prior_sd[at]
+    step = np.clip(before.point.theta[at] + score.theta, 0.0 if effect.non_negative else -limit, limit)
+    point = _along(problem, before, at, step)
     if cost_under(problem, before.weights, before.glances, point) > before.cost:
         point = before.point  # a linear step that led astray
     fitted = fit(problem, named.astype(int), point, used)
@@ -267,8 +287,12 @@ def _against(best: Trial, stage: Stage) -> str | None:
     return None
 
 
-def _verdict(accepted: list[Trial], rivals: list[Trial], last: Stage) -> str:
-    left_over = last.left.gain > REMAINDER or (bool(last.folds) and Foretold.together(last.folds).excess > EXCESS)
+def _verdict(
+    accepted: list[Trial], rivals: list[Trial], last: Stage, reported: tuple[Foretold, Foretold] | None
+) -> str:
+    missed = [Foretold.together(last.folds)] if last.folds else []
+    missed += [] if reported is None else [reported[1]]
+    left_over = last.left.gain > REMAINDER or any(one.excess > EXCESS for one in missed)
     if not accepted:
         return "unexplained" if left_over else "no-effect"
     if left_over:

@@ -179,11 +179,11 @@ def cost_under(problem: Problem, weights: dict[int, Metric], glances: dict[int, 
         for k in frames:
             moment, frame = problem.history.moment(k, point.states), problem.history.frames[k].frame
             missed.append(misfit(problem.sheet, weights[k], theta, frame, moment, jnp.asarray(point.states[k])))
-        tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
+        tool, first = np.array([np.asarray(one.tool)[:, None] for one in missed]), problem.history.frames[frames[0]]
         fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
         middle = np.sum([among_fields(np.asarray(glances[k].square)) for k in frames], axis=0)
         middle += np.eye(N_FIELDS) / problem.amplitude**2
-        total += sum(float(one.squared) for one in missed) + less_offset(tool, tool)[0, 0]
+        total += sum(float(one.squared) for one in missed) + less_offset(tool, tool, first.frame)[0, 0]
         total -= fields @ np.linalg.solve(middle, fields)
     return float(total)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, Timed
 from jiggle_mj.estimator.attribution.still_noise import StillNoise, measure
 from jiggle_mj.estimator.config import EstimatorConfig
@@ -15,11 +15,13 @@ from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Detection, Estimate
-from jiggle_mj.observation import Declaration, MeasuredPoints, Observation
+from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, ToolReport
 
 ASSUMED_SD, ASSUMED_LENGTH = 2e-4, 1.2e-2
 """White and smooth part of what is seen, each, and the range, where neither still frames nor the recording say [m]."""
 
+STANDING = 1e-3
+"""How far the tool may say that it has gone since the jaws closed while nothing counts as moved yet [m]."""
 PARTS = 3
 """Into which a single grasp is divided; the last is foretold and decides nothing."""
 
@@ -50,7 +52,8 @@ def gather(
     Raises:
         PerceptionError: no frame with closed jaws could be used.
     """
-    estimator, frames, still, stated = Estimator(declaration, camera, config=config), [], [], ASSUMED_SD
+    estimator, frames, stated = Estimator(declaration, camera, config=config), [], ASSUMED_SD
+    still: dict[int, list[MeasuredPoints]] = {}
     began: int | None = None
     grasp, closed = -1, 0
     for observation in observations:
@@ -60,21 +63,24 @@ def gather(
             stated = observation.points.sd
         if found is None:
             if not frames and observation.points is not None:
-                still.append(observation.points)
+                still.setdefault(0, []).append(observation.points)
             began = observation.time if not frames else began
             continue
         if observation.tool.grasp != grasp:
             grasp, closed = observation.tool.grasp, observation.time
         began = observation.time if began is None else began
         frames.append(_timed(estimator, observation, found, since=began, closed=closed))
+        if observation.points is not None and np.linalg.norm(frames[-1].frame.way) < STANDING:
+            still.setdefault(grasp, []).append(observation.points)
     if not frames:
         raise PerceptionError("no frame with closed jaws could be used, so there is nothing to close the loop over.")
     estimator.release()
-    noise = _noise_of(still, estimator) or assumed(stated)
+    before, holding = [still.pop(0, [])], list(still.values())
+    noise = _noise_of(before, estimator) or _noise_of(holding, estimator) or assumed(stated)
     fields, sd = noise.fields(estimator.sheet.rest)
     return Gathered(
         estimator=estimator,
-        frames=_parted([_weighed(one, sd) for one in frames]),
+        frames=_parted([_weighed(one, sd, fields) for one in frames]),
         noise=noise,
         fields=fields,
         detection=estimator.detection,
@@ -97,8 +103,10 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, s
             precision=jnp.zeros((len(visible), 3, 3)),
             held=jnp.asarray(hold.held),
             loaded=jnp.asarray(estimator.loaded(hold.held)),
-            closed_at=jnp.asarray(hold.closed_at),
+            turned=jnp.asarray(hold.turned(observation.tool)),
             way=jnp.asarray(observation.tool.position - hold.tip),
+            by_points=jnp.asarray(observation.tool.by_points),
+            held_sd=jnp.zeros(()),
         )
     return Timed(
         frame=frame,
@@ -108,14 +116,21 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, s
         time=(found.time - since) / 1e9,
         closed=(found.time - closed) / 1e9,
         state=found.positions,
+        reports=tuple(
+            ((report.time - since) / 1e9, report.position - hold.tip)
+            for report in (*observation.reports, ToolReport(time=observation.time, position=observation.tool.position))
+            if report.time >= closed
+        ),
     )
 
 
-def _weighed(one: Timed, sd: float) -> Timed:
-    """With the white noise's precision on what is seen."""
+def _weighed(one: Timed, sd: float, fields: Float[np.ndarray, "n modes"]) -> Timed:
+    """With what the noise says of how well single particles, and the held ones together, are seen."""
+    held = np.asarray(one.frame.held & one.frame.visible)
+    shared = np.sum(fields[held].mean(axis=0) ** 2) + sd**2 / held.sum() if held.any() else 0.0
     with jax.enable_x64(True):
         precision = jnp.where(one.frame.visible[:, None, None], jnp.eye(3)[None] / sd**2, 0.0)
-    return replace(one, frame=replace(one.frame, precision=precision))
+        return replace(one, frame=replace(one.frame, precision=precision, held_sd=jnp.asarray(np.sqrt(shared))))
 
 
 def _parted(frames: list[Timed]) -> list[Timed]:
@@ -125,15 +140,19 @@ def _parted(frames: list[Timed]) -> list[Timed]:
     return [replace(one, part=1 + PARTS * k // len(frames)) for k, one in enumerate(frames)]
 
 
-def _noise_of(still: list[MeasuredPoints], estimator: Estimator) -> StillNoise | None:
-    """From tracked points before the jaws close."""
+def _noise_of(series: list[list[MeasuredPoints]], estimator: Estimator) -> StillNoise | None:
+    """From tracked points in series of frames in which nothing moves."""
     ids = estimator.track_ids
-    if ids is None or not still:
+    if ids is None:
         return None
+    return measure([_by_particle(still, ids) for still in series], estimator.sheet.rest)
+
+
+def _by_particle(still: list[MeasuredPoints], ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "frames n 3"]:
     positions = np.full((len(still), len(ids), 3), np.nan)
     for row, points in zip(positions, still, strict=True):
         assert points.track_id is not None
         place = {int(track): k for k, track in enumerate(points.track_id)}
         known = [k for k, track in enumerate(ids) if int(track) in place]
         row[known] = points.positions[[place[int(ids[k])] for k in known]]
-    return measure(positions, estimator.sheet.rest)
+    return positions

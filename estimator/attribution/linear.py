@@ -77,7 +77,7 @@ class Glance(eqx.Module):
     square: Float[Array, "k k"]
     """(n + directions + fields + 1) squared."""
     tool: Float[Array, "3 j"]
-    """Rows of what the tool says of the held particles, over theta, fields (zero) and e, in units of `TOOL_SD`."""
+    """Rows of what the tool says of the held particles, over theta, fields (zero) and e, in units of `tool_sd`."""
 
 
 class Misfit(eqx.Module):
@@ -87,7 +87,17 @@ class Misfit(eqx.Module):
     fields: Float[Array, " q"]
     """Q^T N^-1 e."""
     tool: Float[Array, " 3"]
-    """In units of `TOOL_SD`."""
+    """In units of `tool_sd`."""
+
+
+def tool_sd(frame: ClosedFrame) -> Float[Array, ""]:
+    """Of what the mean of the held particles is seen to do, from frame to frame [m]."""
+    return jnp.hypot(TOOL_SD, frame.held_sd)
+
+
+def grasp_sd(frame: ClosedFrame) -> Float[Array, ""]:
+    """The same, of a whole grasp [m]."""
+    return jnp.hypot(GRASP_SD, frame.held_sd)
 
 
 @eqx.filter_jit
@@ -111,7 +121,7 @@ def glance(
     apply = jax.vmap(lambda v: balance.apply(linear.rows, v), in_axes=2, out_axes=2)
     fields = _fields(model.term(TriangleMembrane), sheet.balance.energy.rest, linear.error)
     smooth = noise[:, None, :, None] * jnp.eye(3)[None, :, None, :]
-    smooth = apply(jnp.where(counted[:, None, None], smooth.reshape(len(s), 3, -1), 0.0))
+    smooth = apply(_as_seen(frame, smooth.reshape(len(s), 3, -1)))
     white = jax.vmap(lambda v: balance.whitened(linear, v), in_axes=2, out_axes=2)(smooth)
     spread = jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white))
     metric = Metric(
@@ -122,18 +132,16 @@ def glance(
         to = theta + directions @ u
         changed = sheet.model(to, moment, frame.way)
         unbalanced = sheet.balance_of(changed.energy).unbalanced(x, s)
-        return unbalanced, look(changed, x, moment), beyond_tool(sheet, changed, to, frame, moment, x)
+        return unbalanced, look(changed, x), beyond_tool(sheet, changed, to, frame, moment, x)
 
     push, shown, taken = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
-    held = mean_of_held(frame, shown)
-    moved = jnp.where(counted[:, None, None], shown, jnp.where(frame.held[:, None, None], held[None], 0.0))
-    e = metric.forces(frame.y - look(model, x, moment)) + linear.unbalanced
-    columns = jnp.concatenate([push - apply(moved), fields, e[:, :, None]], axis=2)
+    e = metric.forces(frame.y - look(model, x)) + linear.unbalanced
+    columns = jnp.concatenate([push - apply(_as_seen(frame, shown)), fields, e[:, :, None]], axis=2)
     square = _whole(metric, columns)
     tool = jnp.concatenate(
         [taken, jnp.zeros((3, N_FIELDS)), beyond_tool(sheet, model, theta, frame, moment, x)[:, None]], axis=1
     )
-    return Glance(square=square, tool=jnp.where(moment.closed > 0, tool / TOOL_SD, 0.0)), metric
+    return Glance(square=square, tool=jnp.where(moment.closed > 0, tool / tool_sd(frame), 0.0)), metric
 
 
 @eqx.filter_jit
@@ -147,10 +155,17 @@ def misfit(
 ) -> Misfit:
     """Of another prediction x of the same frame."""
     model = sheet.model(theta, moment, frame.way)
-    e = metric.forces(frame.y - look(model, x, moment))[:, :, None]
+    e = metric.forces(frame.y - look(model, x))[:, :, None]
     against = metric.dot(jnp.concatenate([metric.fields, e], axis=2), e)[:, 0]
-    tool = beyond_tool(sheet, model, theta, frame, moment, x) / TOOL_SD
+    tool = beyond_tool(sheet, model, theta, frame, moment, x) / tool_sd(frame)
     return Misfit(squared=against[-1], fields=against[:-1], tool=jnp.where(moment.closed > 0, tool, 0.0))
+
+
+def _as_seen(frame: ClosedFrame, off: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
+    """What is off where positions are seen: of each particle that counts, and together of those that are held."""
+    counted = frame.visible & ~frame.held
+    held = jnp.where(frame.held[:, None, None], mean_of_held(frame, off)[None], 0.0)
+    return jnp.where(counted[:, None, None], off, held)
 
 
 def _whole(metric: Metric, columns: Float[Array, "n 3 k"]) -> Float[Array, "_k _k"]:

@@ -2,7 +2,8 @@
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.linear import GRASP_SD, N_FIELDS, TOOL_SD, Glance
+from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
+from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, grasp_sd, tool_sd
 from jiggle_mj.estimator.attribution.problem import Problem
 
 FIELDS = slice(-1 - N_FIELDS, -1)
@@ -16,7 +17,7 @@ def reduced(problem: Problem, glances: dict[int, Glance], d: int) -> Float[np.nd
         whole = np.sum([np.asarray(glances[k].square) for k in frames], axis=0)
         rows = np.array([np.asarray(glances[k].tool) for k in frames])
         n = len(whole) - rows.shape[2]
-        whole[n:, n:] += less_offset(rows, rows)
+        whole[n:, n:] += less_offset(rows, rows, problem.history.frames[frames[0]].frame)
         left = np.r_[0 : n + d, len(whole) - 1]
         middle = among_fields(whole) + np.eye(N_FIELDS) / problem.amplitude**2
         beside = whole[FIELDS][:, left]
@@ -38,8 +39,10 @@ def without_stiffnesses(
     return square[n:, n:] - beside @ np.linalg.solve(square[:n, :n] + np.diag(site_precision), beside.T)
 
 
-def less_offset(left: Float[np.ndarray, "t 3 a"], right: Float[np.ndarray, "t 3 b"]) -> Float[np.ndarray, "a b"]:
-    """Products of the tool's rows over a grasp's frames, an offset common to them eliminated."""
-    ratio = (GRASP_SD / TOOL_SD) ** 2
+def less_offset(
+    left: Float[np.ndarray, "t 3 a"], right: Float[np.ndarray, "t 3 b"], frame: ClosedFrame
+) -> Float[np.ndarray, "a b"]:
+    """Products of the tool's rows over a grasp's frames, such as `frame`, an offset common to them eliminated."""
+    ratio = float(grasp_sd(frame) / tool_sd(frame)) ** 2
     share = ratio / (1 + ratio * len(left))
     return np.einsum("tia,tib->ab", left, right) - share * np.einsum("ia,ib->ab", left.sum(0), right.sum(0))

@@ -57,9 +57,9 @@ class Sheet(eqx.Module):
         return eqx.tree_at(lambda b: (b.energy, b.tethered.energy.rest, b.tethered.energy.terms), self.balance, changed)
 
 
-def look(model: SheetModel, x: Float[Array, "n 3"], moment: Moment) -> Float[Array, "n 3"]:
+def look(model: SheetModel, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """Where particles at x are seen."""
-    return model.view(x, before=moment.before, tangents=tangents(model.term(TriangleMembrane), x))
+    return model.view(x, tangents=tangents(model.term(TriangleMembrane), x))
 
 
 def closed_on(sheet: Sheet, theta: Float[Array, " p"], frame: ClosedFrame, moment: Moment) -> Float[Array, "n 3"]:
@@ -67,7 +67,7 @@ def closed_on(sheet: Sheet, theta: Float[Array, " p"], frame: ClosedFrame, momen
     then = (moment.time - moment.closed, jnp.zeros_like(moment.closed))
     model = sheet.model(theta, eqx.tree_at(lambda m: (m.time, m.closed), moment, then), frame.way)
     along = tangents(model.term(TriangleMembrane), moment.rest)
-    return 2 * frame.closed_at - model.view(frame.closed_at, before=frame.closed_at, tangents=along)
+    return 2 * frame.turned - model.view(frame.turned, tangents=along)
 
 
 def beyond_tool(
@@ -78,15 +78,16 @@ def beyond_tool(
     moment: Moment,
     x: Float[Array, "n 3"],
 ) -> Float[Array, " 3"]:
-    """By how much the held particles have gone further than the tool [m]."""
-    return held_way(model, frame, closed_on(sheet, theta, frame, moment), x, moment) - model.tool
+    """By how much the held particles have gone further than the tool [m]; 0 where it says nothing of its own."""
+    further = held_way(model, frame, closed_on(sheet, theta, frame, moment), x) - model.tool
+    return jnp.where(frame.by_points, 0.0, further)
 
 
 def held_way(
-    model: SheetModel, frame: ClosedFrame, closed: Float[Array, "n 3"], x: Float[Array, "n 3"], moment: Moment
+    model: SheetModel, frame: ClosedFrame, closed: Float[Array, "n 3"], x: Float[Array, "n 3"]
 ) -> Float[Array, " 3"]:
     """How far the held particles have gone as seen, the view's errors taken off [m]; as the tool says if none is."""
-    gone = mean_of_held(frame, x + frame.y - look(model, x, moment) - closed)
+    gone = mean_of_held(frame, x + frame.y - look(model, x) - closed)
     return jnp.where(jnp.any(frame.held & frame.visible), gone, model.tool)
 
 
@@ -118,12 +119,13 @@ def predict(
     """The equilibrium, searched from `start`; what is held goes where it was seen, or where the tool says."""
     model = sheet.model(theta, moment, frame.way)
     closed = closed_on(sheet, theta, frame, moment)
-    to = closed + jnp.where(by_tool, model.tool, held_way(model, frame, closed, start, moment))[None]
+    told = by_tool & ~frame.by_points
+    to = closed + jnp.where(told, model.tool, held_way(model, frame, closed, start))[None]
     precision = jnp.broadcast_to(GRIPPED * jnp.eye(3)[None], (len(s), 3, 3))
     gripped = Evidence(y=to, precision=precision, held=frame.held, loaded=frame.loaded)
     begun = jnp.where(frame.held[:, None], to, start)
     x = sheet.balance_of(model.energy).predict(begun, s, gripped)
-    return Predicted(x=x, seen=look(model, x, moment))
+    return Predicted(x=x, seen=look(model, x))
 
 
 def predict_all(

@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 PAIRS = 20_000
 """Pairs of points whose covariance is looked at."""
-LENGTHS = np.geomspace(2e-3, 5e-2, 40)
-"""Ranges that are tried [m]."""
+LENGTHS = np.geomspace(0.02, 0.5, 40)
+"""Ranges that are tried, in extents of the sheet."""
 MOST_SMOOTH = 0.95
 """Largest share of the variance that the smooth part may be."""
 MODES = 45
@@ -25,8 +25,11 @@ KEPT = 0.97
 """Share of the smooth part's variance that they hold; the rest counts as white."""
 FEWEST = 5
 """Still frames from which noise is measured."""
-JUMP = 4.0
-"""Times the usual square of a difference, beyond which something else has happened between two frames."""
+USUALLY = 0.9
+"""Share of the frames in which a point must be seen."""
+JUMP, RARELY = 4.0, 0.1
+"""Times the usual square of a difference, beyond which something else has happened between two frames, and the largest
+share of them for which that holds: what happens more often is noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,23 +58,31 @@ class StillNoise:
 
 
 def measure(
-    positions: Float[np.ndarray, "frames n 3"], rest: Float[np.ndarray, "n 3"], *, seed: int = 0
+    series: list[Float[np.ndarray, "frames n 3"]], rest: Float[np.ndarray, "n 3"], *, seed: int = 0
 ) -> StillNoise | None:
-    """From the same points in frames in which nothing moves; NaN where one is not seen. None if there are too few."""
-    seen = np.isfinite(positions).all(axis=(0, 2))
-    frames = len(positions)
-    if frames < FEWEST or seen.sum() < 3:
+    """From the same points in series of frames in which nothing moves; None if there are too few.
+
+    NaN where one is not seen.
+    """
+    off = np.concatenate([np.zeros((0, *rest.shape)), *(np.diff(one, axis=0) for one in series)]) / np.sqrt(2)
+    frames = len(off) + sum(len(one) > 1 for one in series)
+    if frames < FEWEST:
         return None
-    off = np.diff(positions[:, seen], axis=0) / np.sqrt(2)
+    seen = np.isfinite(off).mean(axis=(0, 2)) > USUALLY
+    off = off[np.isfinite(off[:, seen]).all(axis=(1, 2))][:, seen]
+    if not len(off) or seen.sum() < 3:
+        return None
     squares = np.mean(off**2, axis=(1, 2))
-    off = off[squares <= JUMP * np.median(squares)]
+    jumps = squares > JUMP * np.median(squares)
+    off = off[~jumps] if jumps.mean() <= RARELY else off
     total = float(np.mean(off**2))
     i, j = np.random.default_rng(seed).integers(0, int(seen.sum()), (2, PAIRS))
     i, j = i[i != j], j[i != j]
     apart = np.sum((rest[seen][i] - rest[seen][j]) ** 2, axis=1)
     together = np.mean(off[:, i] * off[:, j], axis=(0, 2))
-    best = (np.inf, 0.0, float(LENGTHS[0]))
-    for length in LENGTHS:
+    lengths = float(np.ptp(rest, axis=0).max()) * LENGTHS
+    best = (np.inf, 0.0, float(lengths[0]))
+    for length in lengths:
         kernel = np.exp(-0.5 * apart / length**2)
         amplitude = max(float(kernel @ together / (kernel @ kernel)), 0.0)
         best = min(best, (float(np.sum((together - amplitude * kernel) ** 2)), amplitude, float(length)))

@@ -44,11 +44,11 @@ def _check(effect: Effect, plain: SheetModel, moment: Moment, x: jax.Array) -> N
 
     def shown(theta: jax.Array) -> jax.Array:
         model = effect.acts(plain, theta, moment)
-        parts = (model.energy.internal_gradient(x), look(model, x, moment), model.tool, model.energy.rest)
+        parts = (model.energy.internal_gradient(x), look(model, x), model.tool, model.energy.rest)
         return jnp.concatenate([part.ravel() for part in parts])
 
     without = jnp.concatenate(
-        [part.ravel() for part in (plain.energy.internal_gradient(x), look(plain, x, moment), plain.tool, moment.rest)]
+        [part.ravel() for part in (plain.energy.internal_gradient(x), look(plain, x), plain.tool, moment.rest)]
     )
     if not np.allclose(shown(zero), without, rtol=0, atol=1e-9):
         raise ValueError(f"Effect {effect.name} must do nothing where all its parameters are 0.")

@@ -27,6 +27,8 @@ class Effect:
     sites: int = 1
     """At how many places, or in how many directions, it may be, at one of them alone; `acts` takes the parameters of
     all of them, one site after the other."""
+    natural: tuple[float, ...] | None = None
+    """Parameters from which a fit may begin, for an effect that does not show in its derivatives at 0."""
     source: str
     """Where the prior's scale comes from."""
     confounded_with: tuple[str, ...] = ()

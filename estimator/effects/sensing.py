@@ -21,18 +21,13 @@ def _tool_scale(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) ->
 
 
 def _tool_latency(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
-    """What is reported now is where the tool was theta ago; where the jaws close, what they hold has gone nowhere."""
-
-    def at(time: Array) -> Array:
-        return jnp.stack([jnp.interp(time, moment.report_times, moment.reports[:, k]) for k in range(3)])
-
-    further = at(moment.time + theta[0]) - at(moment.time)
-    return _taken(model, model.tool + jnp.where(moment.closed > 0, further, 0.0))
+    """What is reported now is where the tool was theta ago."""
+    return _at_another_time(model, moment, theta[0])
 
 
 def _image_latency(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
-    """What is seen now is how the sheet was theta ago."""
-    return eqx.tree_at(lambda one: one.view.lag, model, model.view.lag + theta[0] / moment.gap)
+    """What is seen now is the sheet as the tool held it theta ago."""
+    return _at_another_time(model, moment, -theta[0])
 
 
 def _camera_bias(model: SheetModel, theta: Float[Array, " 6"], moment: Moment) -> SheetModel:
@@ -54,6 +49,16 @@ def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], moment: Moment) -
 def _point_slip(model: SheetModel, theta: Float[Array, " 2"], moment: Moment) -> SheetModel:
     """What is followed slides over the sheet, more and more."""
     return eqx.tree_at(lambda one: one.view.slip, model, model.view.slip + moment.time * theta)
+
+
+def _at_another_time(model: SheetModel, moment: Moment, later: Float[Array, ""]) -> SheetModel:
+    """With the tool where its reports have it so much later; where the jaws close, what they hold has gone nowhere."""
+
+    def at(time: Array) -> Array:
+        return jnp.stack([jnp.interp(time, moment.report_times, moment.reports[:, k]) for k in range(3)])
+
+    further = at(moment.time + later) - at(moment.time)
+    return _taken(model, model.tool + jnp.where(moment.closed > 0, further, 0.0))
 
 
 def _taken(model: SheetModel, way: Float[Array, " 3"]) -> SheetModel:
@@ -106,6 +111,7 @@ SENSING = (
         prior_sd=(0.2,),
         source="video of a surgical robot comes 0.06 to 0.26 s late",
         confounded_with=("image_latency", "tool_scale"),
+        non_negative=True,
         sensing=True,
     ),
     Effect(
@@ -115,6 +121,7 @@ SENSING = (
         prior_sd=(0.2,),
         source="video of a surgical robot comes 0.06 to 0.26 s late",
         confounded_with=("tool_latency", "material_damping", "viscous_drag"),
+        non_negative=True,
         sensing=True,
     ),
     Effect(

@@ -24,23 +24,19 @@ Kind = TypeVar("Kind", bound=Term)
 
 
 class View(eqx.Module):
-    """How positions are seen: `shift` + `centre` + `turn` (x - `centre`), after what lags and slips."""
+    """How positions are seen: `shift` + `centre` + `turn` (x - `centre`), after what slips."""
 
     centre: Float[Array, " 3"]
     """The middle of the sheet at rest [m]."""
     turn: Float[Array, "3 3"]
     shift: Float[Array, " 3"]
     """[m]."""
-    lag: Float[Array, ""]
-    """Share of the way back to the frame before."""
     slip: Float[Array, " 2"]
     """How far what is followed has slid over the sheet, along its two material axes [m]."""
 
-    def __call__(
-        self, x: Float[Array, "n 3"], *, before: Float[Array, "n 3"], tangents: Float[Array, "n 3 2"]
-    ) -> Float[Array, "n 3"]:
-        """Where particles at x are seen, that were at `before` in the frame before and slide along `tangents`."""
-        there = x + self.lag * (before - x) + tangents @ self.slip
+    def __call__(self, x: Float[Array, "n 3"], *, tangents: Float[Array, "n 3 2"]) -> Float[Array, "n 3"]:
+        """Where particles at x are seen that slide along `tangents`."""
+        there = x + tangents @ self.slip
         return self.centre[None] + self.shift[None] + (there - self.centre[None]) @ self.turn.T
 
 
@@ -132,6 +128,4 @@ def tangents(membrane: TriangleMembrane, x: Float[Array, "n 3"]) -> Float[Array,
 def centred(rest: Float[np.ndarray, "n 3"]) -> View:
     """As it is."""
     nothing = jnp.zeros(3)
-    return View(
-        centre=jnp.asarray(rest.mean(axis=0)), turn=jnp.eye(3), shift=nothing, lag=jnp.zeros(()), slip=jnp.zeros(2)
-    )
+    return View(centre=jnp.asarray(rest.mean(axis=0)), turn=jnp.eye(3), shift=nothing, slip=jnp.zeros(2))
