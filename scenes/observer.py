@@ -110,7 +110,7 @@ class Observer:
         """Keep the past, as far back as `longest` [s]."""
         simulation = self.simulation
         self._history = History(simulation.model, simulation.data, longest=longest)
-        simulation.rules.append(self._history.record)
+        simulation.rules.insert(0, self._history.record)  # before the tool reports
 
     def redraw(self) -> None:
         """Show a changed texture: it lies in the graphics memory."""
