@@ -380,7 +380,7 @@ def test_ctrl_c_leaves_whole_recordings_and_says_how_to_go_on(one_by_one, tmp_pa
     children = Path(f"/proc/{running.pid}/task").glob("*/children")
     workers = " ".join(path.read_text() for path in children).split()
     running.send_signal(signal.SIGINT)
-    _, told = running.communicate(timeout=30)
+    _, told = running.communicate(timeout=120)
     assert running.returncode == 130
     assert "the same command, without --overwrite, goes on" in told and "Traceback" not in told
     assert len(workers) >= 2
