@@ -50,7 +50,7 @@ def story(found: Mapping[str, Any]) -> list[str]:
         numbers = f"{1e3 * held['before_rms_m']:.2f} mm"
         if found["effects"]:
             numbers += f" before, {1e3 * held['after_rms_m']:.2f} mm after"
-        told.append(f"The last part decided nothing; from what the tool says it is foretold to {numbers}.")
+        told.append(f"The last part chose no effect; from what the tool says it is foretold to {numbers}.")
     if not found["noise"]["still_frames"]:
         told.append(
             f"There are no still frames: noise of {1e3 * found['noise']['sd_m']:.2g} mm, and as much that neighbours "
@@ -67,7 +67,7 @@ def _size(value: float, sd: float, unit: str) -> str:
     return f"{value:.{digits}f} ± {sd:.{digits}f} {unit}".strip()
 
 
-TIMES = ("before", "after")
+TIMES, LOCALISED = ("before", "after"), ("localisation", "localisation_after")
 
 
 def write_page(path: Path, *, name: str, sheet: Sheet, found: Mapping[str, Any]) -> None:
@@ -104,7 +104,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
             "log Bayes factor of each effect, one linear step [nat]",
             "what the miss goes with (rank correlation), before and after",
             "miss of each fitted frame [mm]",
-            "parts left out of the fit, then one that decided nothing [mm]",
+            "parts left out of the fit, then one that chose no effect [mm]",
         ),
         vertical_spacing=0.1,
     )
@@ -112,10 +112,10 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
     misses = {
         when: 1e3
         * np.array([np.nan if one is None else np.linalg.norm(one) for one in found[key]["particles"]["mean_off_m"]])
-        for when, key in zip(TIMES, ("localisation", "localisation_after"), strict=True)
+        for when, key in zip(TIMES, LOCALISED, strict=True)
     }
     most = float(np.nanmax([np.nanmax(miss) for miss in misses.values()]))
-    for column, (miss, key) in enumerate(zip(misses.values(), ("localisation", "localisation_after"), strict=True), 1):
+    for column, (miss, key) in enumerate(zip(misses.values(), LOCALISED, strict=True), 1):
         marker = {"color": miss, "cmin": 0, "cmax": most, "colorscale": "Viridis", "showscale": column == 2, "size": 9}
         marker["colorbar"] = {"len": 0.28, "y": 0.87}
         marker["line"] = {"color": RING, "width": [2.5 if one else 0 for one in found[key]["particles"]["attached"]]}
@@ -126,7 +126,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
     bars = go.Bar(x=[one["log_bayes_factor"] for one in likely], y=[one["name"] for one in likely], orientation="h",
                   marker={"color": BEFORE}, showlegend=False)  # fmt: skip
     figure.add_trace(bars, row=2, col=1)
-    for when, key, colour in zip(TIMES, ("localisation", "localisation_after"), (BEFORE, AFTER), strict=True):
+    for when, key, colour in zip(TIMES, LOCALISED, (BEFORE, AFTER), strict=True):
         goes = {name: value for name, value in found[key]["goes_with"].items() if value is not None}
         figure.add_trace(
             go.Bar(x=[*goes.values()], y=[*goes], orientation="h", marker={"color": colour}, name=when), row=2, col=2
@@ -137,7 +137,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
                           marker={"color": colour}, showlegend=False)  # fmt: skip
         figure.add_trace(line, row=3, col=1)
         held = [one[f"{when}_rms_m"] for one in found["held_out"]["folds"]] + [found["held_out"][f"{when}_rms_m"]]
-        labels = [f"left out {k + 1}" for k in range(len(held) - 1)] + ["decided nothing"]
+        labels = [f"left out {k + 1}" for k in range(len(held) - 1)] + ["chose no effect"]
         bars = go.Bar(x=labels, y=[None if one is None else 1e3 * one for one in held], marker={"color": colour},
                       name=when, showlegend=False)  # fmt: skip
         figure.add_trace(bars, row=3, col=2)

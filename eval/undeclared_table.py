@@ -112,8 +112,7 @@ def scene_with(undeclared: str, seed: int) -> Scene:
         increments=5,
         lowering=1,
     )
-    effect_and = INSIDE.get(undeclared, ("",))
-    disturbances = (OUTSIDE[undeclared],) if undeclared in OUTSIDE else effect_and[1:]
+    disturbances = (OUTSIDE[undeclared],) if undeclared in OUTSIDE else INSIDE.get(undeclared, (NOTHING,))[1:]
     return replace(
         arc,
         name=f"undeclared, {undeclared}",

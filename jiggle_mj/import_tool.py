@@ -11,11 +11,10 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
 from jiggle_mj.errors import RecordingError
-from jiggle_mj.import_declaration import GraspPath, MeasuredRecording, ReportedTool, Rows, WorldFrame
+from jiggle_mj.import_declaration import GraspPath, MeasuredRecording, ReportedTool, Rows
 from jiggle_mj.observation import ToolReport, ToolState
 from jiggle_mj.point_files import read_npz, read_rows
-
-UNTURNED = (1.0, 0.0, 0.0, 0.0)
+from jiggle_mj.recording_schemas import UNTURNED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +25,8 @@ class Reports:
     """[ns], from the first frame."""
     positions: Float[np.ndarray, "r 3"]
     """World [m]."""
-    turns: Rotation
-    """World."""
+    turns: Slerp
+    """Orientations in the world by time [ns]."""
     after: int
     """How long each run shows the sheet at rest [ns]."""
 
@@ -43,7 +42,7 @@ class Reports:
         """Position [m] and orientation, w first, at a time [ns]."""
         now = np.clip(time, self.times[0], self.times[-1])
         position = np.array([np.interp(now, self.times, self.positions[:, k]) for k in range(3)])
-        return position, Slerp(self.times, self.turns)(now).as_quat(scalar_first=True)
+        return position, self.turns(now).as_quat(scalar_first=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +101,7 @@ class Tool:
             began: when it began [ns].
             positions: of the points, world [m].
         """
-        grasp, turn, closed = self.said.grasp, np.array(UNTURNED), True
+        grasp, turn, closed = self.said.grasp, UNTURNED, True
         if self.reports is not None:
             tip, turn = self.reports.at(time)
             closed = time - began >= self.reports.after
@@ -134,13 +133,10 @@ def _reports(folder: Path, said: MeasuredRecording, grasp: ReportedTool, origin:
     turns = np.tile(UNTURNED, (count, 1)) if grasp.turns is None else read_npz(archive, grasp.turns)
     if turns.shape != (count, 4):
         raise RecordingError(f"{archive}: {grasp.turns} must have shape ({count}, 4), w first; it has {turns.shape}.")
+    times = np.round((seconds - origin) * 1e9).astype(np.int64)
     return Reports(
-        times=np.round((seconds - origin) * 1e9).astype(np.int64),
+        times=times,
         positions=positions * said.unit @ frame.rotation.T + frame.translation,
-        turns=_in_world(turns, frame),
+        turns=Slerp(times, Rotation.from_matrix(frame.rotation) * Rotation.from_quat(turns, scalar_first=True)),
         after=round(grasp.after * 1e9),
     )
-
-
-def _in_world(turns: Float[np.ndarray, "r 4"], frame: WorldFrame) -> Rotation:
-    return Rotation.from_matrix(frame.rotation) * Rotation.from_quat(turns, scalar_first=True)

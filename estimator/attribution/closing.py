@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, cost_under, fit, gains_over, start, without
+from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, cost_under, fit, gains_over, moved, start, without
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
-from jiggle_mj.estimator.attribution.problem import Point, Problem
+from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.attribution.scores import Score, occam, scores
 from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.effects import LIBRARY, Effect
@@ -90,7 +90,7 @@ class Closed:
     stages: list[Stage]
     """The first with what is declared alone."""
     reported: tuple[Foretold, Foretold] | None
-    """A part that decided nothing, foretold before and after; None if there was none to spare."""
+    """A part that chose no effect, foretold before and after; None if there was none to spare."""
     problem: Problem
 
 
@@ -183,8 +183,7 @@ def _trials(
     problem: Problem, stage: Stage, accepted: list[Trial], used: set[int], say: Callable[[str], None]
 ) -> list[Trial]:
     """The likeliest effects, fitted, the best first, as far as they are worth a look."""
-    found = [_where_natural(problem, stage, one) for one in scores(problem, stage.fitted)]
-    found.sort(key=lambda one: -one.log_bayes_factor)
+    found = scores(problem, stage.fitted)
     stage.scores.extend(found)
     say("scores: " + ", ".join(f"{one.name} {one.log_bayes_factor:.1f}" for one in found[:6]))
     trials = [_fitted(problem, stage, one, accepted, used) for one in _likely(problem, found)]
@@ -192,26 +191,6 @@ def _trials(
         say(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
     trials = [one for one in trials if one.log_bayes_factor > ENTER]
     return sorted(trials, key=lambda one: (not one.sensible, -one.log_bayes_factor))
-
-
-def _where_natural(problem: Problem, stage: Stage, score: Score) -> Score:
-    """An effect's score, or that of what it explains at its natural size, where that is more."""
-    effect, before = problem.sheet.effect(score.name), stage.fitted
-    if effect.natural is None:
-        return score
-    theta = np.array(effect.natural)
-    point = _along(problem, before, problem.sheet.place(effect.name, score.site), theta)
-    cost = cost_under(problem, before.weights, before.glances, point)
-    prior = np.sum((theta / np.asarray(effect.prior_sd)) ** 2)
-    gain = (before.cost - cost - prior) / 2
-    return score if gain <= score.log_bayes_factor else replace(score, log_bayes_factor=gain, theta=theta)
-
-
-def _along(problem: Problem, fitted: Fitted, at: np.ndarray, theta: np.ndarray) -> Point:
-    """A fit's point with other values of some parameters."""
-    changed = fitted.point.theta.copy()
-    changed[at] = theta
-    return start(problem, changed, fitted.point.s, fitted.point.states, list(fitted.glances))
 
 
 def _likely(problem: Problem, found: list[Score]) -> list[Score]:
@@ -254,7 +233,7 @@ def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial],
     named = np.concatenate([*(problem.sheet.place(one.effect.name, one.score.site) for one in accepted), at])
     before, limit = stage.fitted, START * problem.prior_sd[at]
     step = np.clip(before.point.theta[at] + score.theta, 0.0 if effect.non_negative else -limit, limit)
-    point = _along(problem, before, at, step)
+    point = moved(problem, before, at, step)
     if cost_under(problem, before.weights, before.glances, point) > before.cost:
         point = before.point  # a linear step that led astray
     fitted = fit(problem, named.astype(int), point, used)

@@ -71,7 +71,7 @@ def _effect(closed: Closed, one: Trial) -> dict[str, Any]:
 
 
 def _reported(reported: tuple[Foretold, Foretold] | None) -> dict[str, float | None]:
-    """On the grasp that decided nothing."""
+    """On the grasp that chose no effect."""
     figures: dict[str, float | None] = {}
     for when, found in zip(("before", "after"), reported or (None, None), strict=True):
         figures[f"{when}_rms_m"] = None if found is None else found.rms

@@ -61,6 +61,13 @@ def start(problem: Problem, theta: np.ndarray, s: np.ndarray, states: np.ndarray
     return Point(theta=theta, s=s, states=states, seen=seen)
 
 
+def moved(problem: Problem, fitted: Fitted, at: np.ndarray, theta: np.ndarray) -> Point:
+    """A fit's point with other values of some parameters, and what it predicts then."""
+    changed = fitted.point.theta.copy()
+    changed[at] = theta
+    return start(problem, changed, fitted.point.s, fitted.point.states, list(fitted.glances))
+
+
 def fit(
     problem: Problem,
     named: np.ndarray,
@@ -179,11 +186,12 @@ def cost_under(problem: Problem, weights: dict[int, Metric], glances: dict[int, 
         for k in frames:
             moment, frame = problem.history.moment(k, point.states), problem.history.frames[k].frame
             missed.append(misfit(problem.sheet, weights[k], theta, frame, moment, jnp.asarray(point.states[k])))
-        tool, first = np.array([np.asarray(one.tool)[:, None] for one in missed]), problem.history.frames[frames[0]]
+        tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
         fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
         middle = np.sum([among_fields(np.asarray(glances[k].square)) for k in frames], axis=0)
         middle += np.eye(N_FIELDS) / problem.amplitude**2
-        total += sum(float(one.squared) for one in missed) + less_offset(tool, tool, first.frame)[0, 0]
+        total += sum(float(one.squared) for one in missed)
+        total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0]
         total -= fields @ np.linalg.solve(middle, fields)
     return float(total)
 

@@ -23,7 +23,7 @@ ASSUMED_SD, ASSUMED_LENGTH = 2e-4, 1.2e-2
 STANDING = 1e-3
 """How far the tool may say that it has gone since the jaws closed while nothing counts as moved yet [m]."""
 PARTS = 3
-"""Into which a single grasp is divided; the last is foretold and decides nothing."""
+"""Into which a single grasp is divided; the last is foretold and chooses no effect."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,8 @@ def gather(
         PerceptionError: no frame with closed jaws could be used.
     """
     estimator, frames, stated = Estimator(declaration, camera, config=config), [], ASSUMED_SD
-    still: dict[int, list[MeasuredPoints]] = {}
+    still: list[MeasuredPoints] = []
+    standing: dict[int, list[MeasuredPoints]] = {}
     began: int | None = None
     grasp, closed = -1, 0
     for observation in observations:
@@ -63,7 +64,7 @@ def gather(
             stated = observation.points.sd
         if found is None:
             if not frames and observation.points is not None:
-                still.setdefault(0, []).append(observation.points)
+                still.append(observation.points)
             began = observation.time if not frames else began
             continue
         if observation.tool.grasp != grasp:
@@ -71,12 +72,11 @@ def gather(
         began = observation.time if began is None else began
         frames.append(_timed(estimator, observation, found, since=began, closed=closed))
         if observation.points is not None and np.linalg.norm(frames[-1].frame.way) < STANDING:
-            still.setdefault(grasp, []).append(observation.points)
+            standing.setdefault(grasp, []).append(observation.points)
     if not frames:
         raise PerceptionError("no frame with closed jaws could be used, so there is nothing to close the loop over.")
     estimator.release()
-    before, holding = [still.pop(0, [])], list(still.values())
-    noise = _noise_of(before, estimator) or _noise_of(holding, estimator) or assumed(stated)
+    noise = _noise_of([still], estimator) or _noise_of(list(standing.values()), estimator) or assumed(stated)
     fields, sd = noise.fields(estimator.sheet.rest)
     return Gathered(
         estimator=estimator,

@@ -65,7 +65,7 @@ def _of_tool(problem: Problem, fitted: Fitted) -> tuple[float, float]:
     squared = 0.0
     for frames in problem.by_part(fitted.glances).values():
         rows = np.array([np.asarray(fitted.glances[k].tool)[:, -1:] for k in frames])
-        squared += float(less_offset(rows, rows, problem.history.frames[frames[0]].frame)[0, 0])
+        squared += float(less_offset(rows, problem.history.frames[frames[0]].frame)[0, 0])
     degrees = 3 * len(fitted.glances)
     variance = max(squared / degrees, 1.0)
     return variance, 0.5 * (squared - squared / variance - degrees * np.log(variance))

@@ -141,7 +141,7 @@ def glance(
     tool = jnp.concatenate(
         [taken, jnp.zeros((3, N_FIELDS)), beyond_tool(sheet, model, theta, frame, moment, x)[:, None]], axis=1
     )
-    return Glance(square=square, tool=jnp.where(moment.closed > 0, tool / tool_sd(frame), 0.0)), metric
+    return Glance(square=square, tool=tool / tool_sd(frame)), metric
 
 
 @eqx.filter_jit
@@ -158,7 +158,7 @@ def misfit(
     e = metric.forces(frame.y - look(model, x))[:, :, None]
     against = metric.dot(jnp.concatenate([metric.fields, e], axis=2), e)[:, 0]
     tool = beyond_tool(sheet, model, theta, frame, moment, x) / tool_sd(frame)
-    return Misfit(squared=against[-1], fields=against[:-1], tool=jnp.where(moment.closed > 0, tool, 0.0))
+    return Misfit(squared=against[-1], fields=against[:-1], tool=tool)
 
 
 def _as_seen(frame: ClosedFrame, off: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:

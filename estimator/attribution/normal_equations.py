@@ -17,7 +17,7 @@ def reduced(problem: Problem, glances: dict[int, Glance], d: int) -> Float[np.nd
         whole = np.sum([np.asarray(glances[k].square) for k in frames], axis=0)
         rows = np.array([np.asarray(glances[k].tool) for k in frames])
         n = len(whole) - rows.shape[2]
-        whole[n:, n:] += less_offset(rows, rows, problem.history.frames[frames[0]].frame)
+        whole[n:, n:] += less_offset(rows, problem.history.frames[frames[0]].frame)
         left = np.r_[0 : n + d, len(whole) - 1]
         middle = among_fields(whole) + np.eye(N_FIELDS) / problem.amplitude**2
         beside = whole[FIELDS][:, left]
@@ -39,10 +39,8 @@ def without_stiffnesses(
     return square[n:, n:] - beside @ np.linalg.solve(square[:n, :n] + np.diag(site_precision), beside.T)
 
 
-def less_offset(
-    left: Float[np.ndarray, "t 3 a"], right: Float[np.ndarray, "t 3 b"], frame: ClosedFrame
-) -> Float[np.ndarray, "a b"]:
+def less_offset(rows: Float[np.ndarray, "t 3 a"], frame: ClosedFrame) -> Float[np.ndarray, "a a"]:
     """Products of the tool's rows over a grasp's frames, such as `frame`, an offset common to them eliminated."""
     ratio = float(grasp_sd(frame) / tool_sd(frame)) ** 2
-    share = ratio / (1 + ratio * len(left))
-    return np.einsum("tia,tib->ab", left, right) - share * np.einsum("ia,ib->ab", left.sum(0), right.sum(0))
+    share, together = ratio / (1 + ratio * len(rows)), rows.sum(0)
+    return np.einsum("tia,tib->ab", rows, rows) - share * np.einsum("ia,ib->ab", together, together)

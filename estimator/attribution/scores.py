@@ -5,14 +5,15 @@ force fields are marginalised, g its score and theta ~ N(0, Theta) before,
 
     ln BF = g^T (V + Theta^-1)^-1 g / 2 - ln |I + Theta V| / 2
 
-for each place where it may be, and the mean of the BFs over the places.
+for each place where it may be, and the mean of the BFs over the places. An effect that does not show in its derivatives
+is also tried at its natural size.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.fit import Fitted, linearised
+from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, linearised, moved
 from jiggle_mj.estimator.attribution.normal_equations import reduced, without_stiffnesses
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.effects.effect import Effect
@@ -25,11 +26,11 @@ class Score:
 
     name: str
     log_bayes_factor: float
-    """Against its absence, linearly."""
+    """Against its absence, linearly; or at its natural size, where that is more."""
     site: int
     """Where it is likeliest."""
     theta: Float[np.ndarray, " p"]
-    """By how much its parameters there would change, in one linear step."""
+    """By how much its parameters there would change, in that step."""
     p_value: float
     """Of the score statistic where the effect is absent, for the best of all its places."""
     kept: float
@@ -47,7 +48,7 @@ def scores(problem: Problem, fitted: Fitted) -> list[Score]:
         for effect in problem.sheet.library
         if not np.isin(problem.sheet.place(effect.name), fitted.named).any()
     ]
-    return sorted(found, key=lambda one: -one.log_bayes_factor)
+    return sorted((_where_natural(problem, fitted, one) for one in found), key=lambda one: -one.log_bayes_factor)
 
 
 def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " named"]]:
@@ -92,6 +93,18 @@ def _one(
         p_value=float(chi2.sf(statistic, len(mine))),
         kept=float(np.clip(kept, 0, 1)),
     )
+
+
+def _where_natural(problem: Problem, fitted: Fitted, score: Score) -> Score:
+    """An effect's score, or that of what it explains at its natural size, where that is more."""
+    effect = problem.sheet.effect(score.name)
+    if effect.natural is None:
+        return score
+    theta = np.array(effect.natural)
+    point = moved(problem, fitted, problem.sheet.place(effect.name, score.site), theta)
+    prior = np.sum((theta / np.asarray(effect.prior_sd)) ** 2)
+    gain = (fitted.cost - cost_under(problem, fitted.weights, fitted.glances, point) - prior) / 2
+    return score if gain <= score.log_bayes_factor else replace(score, log_bayes_factor=float(gain), theta=theta)
 
 
 def _best(sites: list[Score]) -> Score:

@@ -78,9 +78,12 @@ def beyond_tool(
     moment: Moment,
     x: Float[Array, "n 3"],
 ) -> Float[Array, " 3"]:
-    """By how much the held particles have gone further than the tool [m]; 0 where it says nothing of its own."""
+    """By how much the held particles have gone further than the tool [m].
+
+    0 where it says nothing: of its own, or yet, as the jaws have just closed.
+    """
     further = held_way(model, frame, closed_on(sheet, theta, frame, moment), x) - model.tool
-    return jnp.where(frame.by_points, 0.0, further)
+    return jnp.where(frame.by_points | (moment.closed <= 0), 0.0, further)
 
 
 def held_way(
