@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.import_declaration import GraspPath, MeasuredRecording, ReportedTool, Rows
-from jiggle_mj.observation import ToolReport, ToolState
+from jiggle_mj.observation import UNTURNED, ToolReport, ToolState
 from jiggle_mj.point_files import read_npz, read_rows
-from jiggle_mj.recording_schemas import UNTURNED
 
 
 @dataclass(frozen=True, kw_only=True)

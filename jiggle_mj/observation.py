@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jiggle_mj.errors import RecordingError
 
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+"""The quaternion wxyz of no rotation."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class StereoPair:

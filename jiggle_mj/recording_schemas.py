@@ -23,12 +23,10 @@ from scipy.spatial.transform import Rotation
 
 from jiggle_mj.camera import CameraCalibration
 from jiggle_mj.errors import RecordingError
-from jiggle_mj.observation import ToolState
+from jiggle_mj.observation import UNTURNED, ToolState
 
 WORLD = "world"
 CAMERA_FRAMES = {"left": "camera_left_optical", "right": "camera_right_optical"}
-UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
-"""The quaternion wxyz of no rotation."""
 FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 """zlib level 1: a third of the time of the default for a tenth more bytes; the MCAP chunk is compressed besides."""
 
