@@ -46,8 +46,12 @@ class IsometricBending(Term):
 
     def energy(self, x: Float[Array, "h 4 3"]) -> Float[Array, " h"]:
         """[J]."""
-        bent = jnp.einsum("ha,hai->hi", self.weight, x) - self.curvature[:, None] * _normal(x, self.facing)
-        return 0.5 * jnp.sum(bent**2, axis=1)
+        off = jnp.einsum("ha,hai->hi", self.weight, x) - self.curvature[:, None] * _normal(x, self.facing)
+        return 0.5 * jnp.sum(off**2, axis=1)
+
+    def bent(self, x: Float[Array, "h 4 3"]) -> Float[Array, " h"]:
+        """The weighted sums along the normals: c where the hinges are at rest [J^(1/2)]."""
+        return jnp.sum(jnp.einsum("ha,hai->hi", self.weight, x) * _normal(x, self.facing), axis=1)
 
     def positive_hessian(self, x: Float[Array, "h 4 3"]) -> Float[Array, "h 4 3 4 3"]:
         """The Hessian for a flat rest shape, which is semi-definite [N/m]."""

@@ -108,6 +108,36 @@ def test_gravity_and_drag_are_their_closed_forms(plain, moment):
         np.testing.assert_allclose(forces(dragged) - forces(plain), 1e-3 * k * speed, rtol=0, atol=1e-12)
 
 
+def test_what_lags_still_has_to_go_what_an_exponential_leaves(moment):
+    """Of a tool that went evenly up to the frame, in the first half of the time alone, and not at all."""
+    lag, gap = 0.5, float(moment.gap)
+    even = lag / gap * (1 - np.exp(-gap / lag))
+    half = gap / 2
+    times = jnp.array([0.5, 0.5 + half, 1.25, 2.0])
+    stood = eqx.tree_at(
+        lambda m: (m.report_times, m.reports), moment, (times, jnp.asarray(np.outer([1.0, 2.0, 2.0, 3.0], WAY)))
+    )
+    still = eqx.tree_at(lambda m: m.reports, moment, jnp.asarray(np.outer([0.0, 1.0, 1.0, 3.0], WAY)))
+    with jax.enable_x64(True):
+        constant = jnp.asarray(lag)
+        assert float(moment.left_behind(constant)) == pytest.approx(even, rel=1e-3)
+        late = lag / half * (np.exp(-half / lag) - np.exp(-gap / lag))
+        assert float(stood.left_behind(constant)) == pytest.approx(late, rel=1e-3)
+        assert float(still.left_behind(constant)) == pytest.approx(np.exp(-gap / lag), rel=1e-3)
+
+
+def test_damped_tissue_resists_what_it_does_since_the_frame_before(plain, moment):
+    """And hardly anything else: of a hinge that is stretched within its plane the rest shape knows nothing."""
+    with jax.enable_x64(True):
+        damped = EFFECTS["material_damping"].acts(plain, jnp.array([0.3]), moment)
+        there = lambda model, x: np.asarray(model.energy.internal_gradient(x))  # noqa: E731
+        more = there(damped, moment.now) - there(plain, moment.now)
+        none = there(damped, moment.before) - there(plain, moment.before)
+        np.testing.assert_allclose(none, 0, atol=0.01 * np.abs(more).max())
+        assert np.sum(more * np.asarray(moment.now - moment.before)) > 0
+        np.testing.assert_allclose(more.sum(axis=0), 0, atol=1e-12)
+
+
 def test_friction_resists_the_way_along_the_bed_with_its_share_of_the_load(plain, moment):
     with jax.enable_x64(True):
         rest = jnp.asarray(sheet().rest)

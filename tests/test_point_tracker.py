@@ -47,3 +47,17 @@ def test_a_mesh_that_no_frame_shows_is_taken_to_have_a_frames_noise():
 def test_a_mesh_that_is_far_off_is_not_taken_to_be_worse_than_a_frame():
     """A shift of the whole sheet is no noise of its rest shape."""
     assert variance(sheet().rest + 0.01, [points(noisy(0))]) == pytest.approx(2 * SD**2)
+
+
+def test_frames_in_which_the_sheet_has_moved_already_do_not_count_as_rest():
+    still = [points(noisy(seed)) for seed in range(18)] + [points(noisy(seed) + 2e-3) for seed in (18, 19)]
+    rest = PointTracker().start(still).rest
+    np.testing.assert_array_equal(rest, PointTracker().start(still[:18]).rest)
+    assert np.abs(np.mean(rest - sheet().rest, axis=0)).max() < SD / 10
+
+
+def test_frames_that_differ_by_noise_alone_or_half_of_the_time_all_count():
+    alike = [points(noisy(seed)) for seed in range(20)]
+    np.testing.assert_allclose(PointTracker().start(alike).rest, np.mean([one.positions for one in alike], axis=0))
+    halved = alike[:10] + [points(noisy(seed) + 2e-3) for seed in range(10)]
+    assert np.mean(PointTracker().start(halved).rest - sheet().rest) == pytest.approx(1e-3, rel=0.05)

@@ -14,7 +14,7 @@ from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, cost_under, fi
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
-from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.scores import Score, occam, scores
 from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.effects import LIBRARY, Effect
@@ -231,11 +231,8 @@ def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial],
     effect = problem.sheet.effect(score.name)
     at = problem.sheet.place(effect.name, score.site)
     named = np.concatenate([*(problem.sheet.place(one.effect.name, one.score.site) for one in accepted), at])
-    before, limit = stage.fitted, START * problem.prior_sd[at]
-    step = np.clip(before.point.theta[at] + score.theta, 0.0 if effect.non_negative else -limit, limit)
-    point = moved(problem, before, at, step)
-    if cost_under(problem, before.weights, before.glances, point) > before.cost:
-        point = before.point  # a linear step that led astray
+    before = stage.fitted
+    point = _stepped(problem, before, effect, at, score) if score.began is None else score.began
     fitted = fit(problem, named.astype(int), point, used)
     volume, sd = occam(problem, fitted)
     gain = min(gains_over(problem, fitted, before)) - (volume - occam(problem, before)[0]) - np.log(effect.sites)
@@ -247,6 +244,14 @@ def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial],
         theta=fitted.point.theta[at],
         sd=sd[-len(at) :],
     )
+
+
+def _stepped(problem: Problem, before: Fitted, effect: Effect, at: np.ndarray, score: Score) -> Point:
+    """From where there is no such effect by a linear step, unless that leads astray."""
+    limit = START * problem.prior_sd[at]
+    step = np.clip(before.point.theta[at] + score.theta, 0.0 if effect.non_negative else -limit, limit)
+    point = moved(problem, before, at, step)
+    return before.point if cost_under(problem, before.weights, point) > before.cost else point
 
 
 def _against(best: Trial, stage: Stage) -> str | None:

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, glance, misfit
-from jiggle_mj.estimator.attribution.normal_equations import among_fields, less_offset, reduced
+from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, glance, misfit, weigh
+from jiggle_mj.estimator.attribution.normal_equations import less_offset, reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
 from jiggle_mj.estimator.filters.implicit import reconsidered
@@ -74,11 +74,12 @@ def fit(
     point: Point,
     parts: set[int],
     *,
+    passes: int = PASSES,
     say: Callable[[str], None] = lambda _: None,
 ) -> Fitted:
     """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some parts."""
     now, step = _reckoned(problem, named, point, problem.frames(parts))
-    for count in range(PASSES):
+    for count in range(passes):
         better = _shortened(problem, now, step)
         if better is None:
             break
@@ -105,7 +106,8 @@ def _reckoned(
 ) -> tuple[Fitted, tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]]:
     """A point with what is known there, and the step from it."""
     along = directions(problem, problem.free(named), DIRECTIONS)
-    return _found(problem, named, point, *linearised(problem, point, frames, along))
+    weights = weighed(problem, point, frames)
+    return _found(problem, named, point, linearised(problem, point, weights, along), weights)
 
 
 def _found(
@@ -122,7 +124,7 @@ def _found(
         glances=glances,
         weights=weights,
         site_precision=sites,
-        cost=cost_under(problem, weights, glances, point) + _prior(point, free, sd),
+        cost=cost_under(problem, weights, point) + _prior(point, free, sd),
     )
     return found, step
 
@@ -139,7 +141,7 @@ def _shortened(
         theta[free] = np.clip(theta[free], least, most)
         s = np.clip(point.s + share * step[1], 0, STIFFEST)
         trial = start(problem, theta, s, point.states, list(now.glances))
-        cost = cost_under(problem, now.weights, now.glances, trial) + _prior(trial, free, sd)
+        cost = cost_under(problem, now.weights, trial) + _prior(trial, free, sd)
         if cost < now.cost:
             return trial, cost
     return None
@@ -152,17 +154,26 @@ def directions(problem: Problem, free: np.ndarray, width: int) -> Float[np.ndarr
     return along
 
 
-def linearised(
-    problem: Problem, point: Point, frames: list[int], along: Float[np.ndarray, "p d"]
-) -> tuple[dict[int, Glance], dict[int, Metric]]:
-    """Every frame at a point."""
-    glances, weights = {}, {}
-    theta, s, noise, along_ = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise, along))
+def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metric]:
+    """Every frame at a point: how misfits weigh."""
+    theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
+    weights = {}
     for k in frames:
         moment = problem.history.moment(k, point.states)
         frame, x = problem.history.frames[k].frame, jnp.asarray(point.states[k])
-        glances[k], weights[k] = glance(problem.sheet, theta, along_, s, frame, moment, x, noise)
-    return glances, weights
+        weights[k] = weigh(problem.sheet, theta, s, frame, moment, x, noise)
+    return weights
+
+
+def linearised(
+    problem: Problem, point: Point, weights: dict[int, Metric], along: Float[np.ndarray, "p d"]
+) -> dict[int, Glance]:
+    """Every frame where it was weighed: its normal equations."""
+    glances, theta, along_ = {}, jnp.asarray(point.theta), jnp.asarray(along)
+    for k, metric in weights.items():
+        moment = problem.history.moment(k, point.states)
+        glances[k] = glance(problem.sheet, metric, theta, along_, problem.history.frames[k].frame, moment)
+    return glances
 
 
 def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
@@ -172,23 +183,23 @@ def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, 
     """
 
     def judged(judge: Fitted, one: Fitted) -> float:
-        misfit = cost_under(problem, judge.weights, judge.glances, one.point)
+        misfit = cost_under(problem, judge.weights, one.point)
         return misfit + _prior(one.point, one.free, problem.sd(one.named))
 
     return (judged(better, plain) - better.cost) / 2, (plain.cost - judged(plain, better)) / 2
 
 
-def cost_under(problem: Problem, weights: dict[int, Metric], glances: dict[int, Glance], point: Point) -> float:
+def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> float:
     """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
     total, theta = 0.0, jnp.asarray(point.theta)
-    for frames in problem.by_part(glances).values():
+    for frames in problem.by_part(weights).values():
         missed = []
         for k in frames:
             moment, frame = problem.history.moment(k, point.states), problem.history.frames[k].frame
             missed.append(misfit(problem.sheet, weights[k], theta, frame, moment, jnp.asarray(point.states[k])))
         tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
         fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
-        middle = np.sum([among_fields(np.asarray(glances[k].square)) for k in frames], axis=0)
+        middle = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
         middle += np.eye(N_FIELDS) / problem.amplitude**2
         total += sum(float(one.squared) for one in missed)
         total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0]

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.fit import DIRECTIONS, Fitted, directions, linearised
+from jiggle_mj.estimator.attribution.fit import Fitted, weighed
 from jiggle_mj.estimator.attribution.linear import Metric
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
@@ -63,9 +63,7 @@ def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
         states, seen = predict_all(
             problem.sheet, point.theta, point.s, problem.history, states, only=frames, by_tool=True
         )
-    _, weights = linearised(
-        problem, replace(point, states=states), frames, directions(problem, fitted.free, DIRECTIONS)
-    )
+    weights = weighed(problem, replace(point, states=states), frames)
     known, off, sd = _covariance(problem, fitted), [], []
     for k in frames:
         frame = problem.history.frames[k].frame

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
-from jiggle_mj.estimator.attribution.fit import DIRECTIONS, Fitted, cost_under, directions, linearised
+from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, weighed
 from jiggle_mj.estimator.attribution.linear import N_FIELDS, Metric
-from jiggle_mj.estimator.attribution.normal_equations import among_fields, less_offset
+from jiggle_mj.estimator.attribution.normal_equations import less_offset
 from jiggle_mj.estimator.attribution.problem import Problem
 
 VARIANCES = (1.0, 4.0, 16.0, 64.0)
@@ -37,22 +37,18 @@ class Leftover:
 def leftover(problem: Problem, fitted: Fitted) -> Leftover:
     """Of a fit."""
     likelihoods: dict[tuple[float, float], float] = {}
-    along = directions(problem, fitted.free, DIRECTIONS)
     for variance in VARIANCES:
         wider = problem.widened(variance, problem.amplitude)
-        if variance == 1.0:
-            glances, weights = fitted.glances, fitted.weights
-        else:
-            glances, weights = linearised(wider, fitted.point, list(fitted.glances), along)
+        weights = fitted.weights if variance == 1.0 else weighed(wider, fitted.point, list(fitted.weights))
         whole = sum(float(_log_determinant(one)) for one in weights.values())
         fields = [
-            np.sum([among_fields(np.asarray(glances[k].square)) for k in frames], axis=0)
-            for frames in problem.by_part(glances).values()
+            np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
+            for frames in problem.by_part(weights).values()
         ]
         for ratio in AMPLITUDES:
             amplitude = ratio * problem.amplitude
             common = sum(np.linalg.slogdet(np.eye(N_FIELDS) + amplitude**2 * one)[1] for one in fields)
-            cost = cost_under(wider.widened(1.0, amplitude), weights, glances, fitted.point)
+            cost = cost_under(wider.widened(1.0, amplitude), weights, fitted.point)
             likelihoods[variance, ratio] = -(cost + whole + common) / 2
     best = max(likelihoods, key=lambda key: likelihoods[key])
     gain = likelihoods[best] - likelihoods[1.0, 1.0]

@@ -10,6 +10,9 @@ anything might hide, the same in all frames of a grasp. a is eliminated frame by
 state instead of the predicted one this would be an errors-in-variables problem, and invent effects.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -47,10 +50,12 @@ class Metric(eqx.Module):
     """I + F^T H^T N^-1 H F, its lower Cholesky factor."""
     fields: Float[Array, "n 3 q"]
     """Q."""
+    among: Float[Array, "q q"]
+    """Q^T (N + H F F^T H^T)^-1 Q."""
 
     def dot(self, left: Float[Array, "n 3 l"], right: Float[Array, "n 3 r"]) -> Float[Array, "l r"]:
         """left^T (N + H F F^T H^T)^-1 right."""
-        white = jax.vmap(lambda v: self.balance.whitened(self.frame, v), in_axes=2, out_axes=2)(right)
+        white = _each(partial(self.balance.whitened, self.frame), right)
         return self._less(left, right, jnp.einsum("nil,nir->lr", left, white))
 
     def forces(self, off: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
@@ -101,32 +106,49 @@ def grasp_sd(frame: ClosedFrame) -> Float[Array, ""]:
 
 
 @eqx.filter_jit
-def glance(
+def weigh(
     sheet: Sheet,
     theta: Float[Array, " p"],
-    directions: Float[Array, "p d"],
     s: Float[Array, " n"],
     frame: ClosedFrame,
     moment: Moment,
     x: Float[Array, "n 3"],
     noise: Float[Array, "n modes"],
-) -> tuple[Glance, Metric]:
-    """Linearise a frame at its predicted state x; `noise` are the smooth fields of what is seen [m]."""
+) -> Metric:
+    """How misfits of a frame weigh at its predicted state x; `noise` are the smooth fields of what is seen [m]."""
     model = sheet.model(theta, moment, frame.way)
     balance = sheet.balance_of(model.energy)
-    counted = frame.visible & ~frame.held
     precision = jnp.where(frame.held[:, None, None], CARRIED * jnp.eye(3)[None], frame.precision)
     evidence = Evidence(y=x, precision=precision, held=frame.held, loaded=frame.loaded)
     linear = balance.linearise(x, s, evidence)
-    apply = jax.vmap(lambda v: balance.apply(linear.rows, v), in_axes=2, out_axes=2)
     fields = _fields(model.term(TriangleMembrane), sheet.balance.energy.rest, linear.error)
     smooth = noise[:, None, :, None] * jnp.eye(3)[None, :, None, :]
-    smooth = apply(_as_seen(frame, smooth.reshape(len(s), 3, -1)))
-    white = jax.vmap(lambda v: balance.whitened(linear, v), in_axes=2, out_axes=2)(smooth)
-    spread = jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white))
+    smooth = _each(partial(balance.apply, linear.rows), _as_seen(frame, smooth.reshape(len(s), 3, -1)))
+    white = _each(partial(balance.whitened, linear), smooth)
     metric = Metric(
-        balance=balance, frame=linear, seen=counted.astype(float), noise=white, spread=spread, fields=fields
+        balance=balance,
+        frame=linear,
+        seen=(frame.visible & ~frame.held).astype(float),
+        noise=white,
+        spread=jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white)),
+        fields=fields,
+        among=jnp.zeros((N_FIELDS, N_FIELDS)),
     )
+    return eqx.tree_at(lambda one: one.among, metric, metric.dot(fields, fields))
+
+
+@eqx.filter_jit
+def glance(
+    sheet: Sheet,
+    metric: Metric,
+    theta: Float[Array, " p"],
+    directions: Float[Array, "p d"],
+    frame: ClosedFrame,
+    moment: Moment,
+) -> Glance:
+    """A frame's normal equations where it was weighed."""
+    balance, linear = metric.balance, metric.frame
+    x, s = linear.x, linear.s
 
     def along(u):
         to = theta + directions @ u
@@ -135,13 +157,14 @@ def glance(
         return unbalanced, look(changed, x), beyond_tool(sheet, changed, to, frame, moment, x)
 
     push, shown, taken = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
+    model = sheet.model(theta, moment, frame.way)
     e = metric.forces(frame.y - look(model, x)) + linear.unbalanced
-    columns = jnp.concatenate([push - apply(_as_seen(frame, shown)), fields, e[:, :, None]], axis=2)
-    square = _whole(metric, columns)
+    seen = _each(partial(balance.apply, linear.rows), _as_seen(frame, shown))
+    square = _whole(metric, jnp.concatenate([push - seen, metric.fields, e[:, :, None]], axis=2))
     tool = jnp.concatenate(
         [taken, jnp.zeros((3, N_FIELDS)), beyond_tool(sheet, model, theta, frame, moment, x)[:, None]], axis=1
     )
-    return Glance(square=square, tool=tool / tool_sd(frame)), metric
+    return Glance(square=square, tool=tool / tool_sd(frame))
 
 
 @eqx.filter_jit
@@ -161,6 +184,11 @@ def misfit(
     return Misfit(squared=against[-1], fields=against[:-1], tool=tool)
 
 
+def _each(of: Callable[[Array], Array], columns: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
+    """A linear map of each column."""
+    return jax.vmap(of, in_axes=2, out_axes=2)(columns)
+
+
 def _as_seen(frame: ClosedFrame, off: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
     """What is off where positions are seen: of each particle that counts, and together of those that are held."""
     counted = frame.visible & ~frame.held
@@ -175,7 +203,7 @@ def _whole(metric: Metric, columns: Float[Array, "n 3 k"]) -> Float[Array, "_k _
     own = balance.precision_along(frame, slope)
     shared = jnp.einsum("ni,nic->cn", slope, metric.noise)
     own = own - shared.T @ jax.scipy.linalg.cho_solve((metric.spread, True), shared)
-    white = jax.vmap(lambda v: balance.whitened(frame, v), in_axes=2, out_axes=2)(columns)
+    white = _each(partial(balance.whitened, frame), columns)
     others = jnp.einsum("nic,nik->ck", metric.noise, columns)
     solved = jax.scipy.linalg.cho_solve((metric.spread, True), others)
     between = jnp.einsum("ni,nik->nk", slope, white) - shared.T @ solved

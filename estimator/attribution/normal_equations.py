@@ -19,15 +19,10 @@ def reduced(problem: Problem, glances: dict[int, Glance], d: int) -> Float[np.nd
         n = len(whole) - rows.shape[2]
         whole[n:, n:] += less_offset(rows, problem.history.frames[frames[0]].frame)
         left = np.r_[0 : n + d, len(whole) - 1]
-        middle = among_fields(whole) + np.eye(N_FIELDS) / problem.amplitude**2
+        middle = whole[FIELDS, FIELDS] + np.eye(N_FIELDS) / problem.amplitude**2
         beside = whole[FIELDS][:, left]
         total = total + whole[np.ix_(left, left)] - beside.T @ np.linalg.solve(middle, beside)
     return np.asarray(total)
-
-
-def among_fields(square: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "fields fields"]:
-    """What a frame's, or several frames', normal equations say of the smooth force fields."""
-    return square[FIELDS, FIELDS]
 
 
 def without_stiffnesses(

@@ -6,18 +6,21 @@ force fields are marginalised, g its score and theta ~ N(0, Theta) before,
     ln BF = g^T (V + Theta^-1)^-1 g / 2 - ln |I + Theta V| / 2
 
 for each place where it may be, and the mean of the BFs over the places. An effect that does not show in its derivatives
-is also tried at its natural size.
+at 0 is also tried from its natural size, with a few steps of a fit.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, linearised, moved
+from jiggle_mj.estimator.attribution.fit import Fitted, fit, gains_over, linearised, moved
 from jiggle_mj.estimator.attribution.normal_equations import reduced, without_stiffnesses
-from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects.effect import Effect
 from scipy.stats import chi2
+
+STEPS = 2
+"""Of a fit from an effect's natural size."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,13 +29,15 @@ class Score:
 
     name: str
     log_bayes_factor: float
-    """Against its absence, linearly; or at its natural size, where that is more."""
+    """Against its absence, linearly; or from its natural size, where that is more."""
     site: int
     """Where it is likeliest."""
     theta: Float[np.ndarray, " p"]
     """By how much its parameters there would change, in that step."""
     p_value: float
     """Of the score statistic where the effect is absent, for the best of all its places."""
+    began: Point | None = None
+    """Where a fit with it may begin, if not with that step."""
     kept: float
     """Share of the information about it that is left in the worst direction when the rest is marginalised."""
 
@@ -40,7 +45,7 @@ class Score:
 def scores(problem: Problem, fitted: Fitted) -> list[Score]:
     """Every effect of the library that was not fitted already, the likeliest first."""
     n, all_ways = len(fitted.site_precision), np.eye(problem.sheet.size)
-    glances, _ = linearised(problem, fitted.point, list(fitted.glances), all_ways)
+    glances = linearised(problem, fitted.point, fitted.weights, all_ways)
     square = reduced(problem, glances, problem.sheet.size)
     left, whole = without_stiffnesses(square, fitted.site_precision), square[n:, n:]
     found = [
@@ -96,15 +101,18 @@ def _one(
 
 
 def _where_natural(problem: Problem, fitted: Fitted, score: Score) -> Score:
-    """An effect's score, or that of what it explains at its natural size, where that is more."""
+    """An effect's score, or that of a few steps from its natural size, where that is more."""
     effect = problem.sheet.effect(score.name)
     if effect.natural is None:
         return score
-    theta = np.array(effect.natural)
-    point = moved(problem, fitted, problem.sheet.place(effect.name, score.site), theta)
-    prior = np.sum((theta / np.asarray(effect.prior_sd)) ** 2)
-    gain = (fitted.cost - cost_under(problem, fitted.weights, fitted.glances, point) - prior) / 2
-    return score if gain <= score.log_bayes_factor else replace(score, log_bayes_factor=float(gain), theta=theta)
+    at = problem.sheet.place(effect.name, score.site)
+    parts = {problem.history.frames[k].part for k in fitted.glances}
+    begun = moved(problem, fitted, at, np.array(effect.natural))
+    found = fit(problem, np.append(fitted.named, at), begun, parts, passes=STEPS)
+    gain = min(gains_over(problem, found, fitted)) - occam(problem, found)[0] + occam(problem, fitted)[0]
+    if gain <= score.log_bayes_factor:
+        return score
+    return replace(score, log_bayes_factor=float(gain), theta=found.point.theta[at], began=found.point)
 
 
 def _best(sites: list[Score]) -> Score:

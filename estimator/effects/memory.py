@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from jiggle_mj.estimator.bending import IsometricBending
 from jiggle_mj.estimator.effects.effect import Effect
 from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel
 from jiggle_mj.estimator.effects.terms import Load, Rub
@@ -40,11 +41,16 @@ def _inertia(model: SheetModel, theta: Float[Array, " 2"], moment: Moment) -> Sh
 
 
 def _material_damping(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
-    """Kelvin and Voigt's: stress C (E + theta dE/dt)."""
-    membrane, more = model.term(TriangleMembrane), theta[0] / moment.gap
-    before = membrane.strain(moment.before[membrane.vertices])
-    changed = (1 + more) * membrane.elasticity, (membrane.inelastic + more * before) / (1 + more)
-    return model.with_term(eqx.tree_at(lambda t: (t.elasticity, t.inelastic), membrane, changed))
+    """Kelvin and Voigt's: stress C (E + theta dE/dt), of stretching and of bending."""
+    left = moment.left_behind(theta[0])
+    more = left / (1 - left)
+    membrane, bending = model.term(TriangleMembrane), model.term(IsometricBending)
+    strain = membrane.strain(moment.before[membrane.vertices])
+    stiffer = (1 + more) * membrane.elasticity, (membrane.inelastic + more * strain) / (1 + more)
+    stretched = model.with_term(eqx.tree_at(lambda t: (t.elasticity, t.inelastic), membrane, stiffer))
+    bent = (bending.curvature + more * bending.bent(moment.before[bending.vertices])) / (1 + more)
+    weighed = jnp.sqrt(1 + more) * bending.weight, jnp.sqrt(1 + more) * bent
+    return stretched.with_term(eqx.tree_at(lambda t: (t.weight, t.curvature), bending, weighed))
 
 
 def _tissue_creep(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
@@ -104,6 +110,7 @@ MEMORY = (
         acts=_material_damping,
         units=("s",),
         prior_sd=(0.2,),
+        natural=(0.2,),
         source="skin relaxes within 0.1 to 0.3 s",
         confounded_with=("viscous_drag", "tissue_creep", "image_latency"),
         non_negative=True,

@@ -22,6 +22,11 @@ from jiggle_mj.observation import Declaration
 
 Kind = TypeVar("Kind", bound=Term)
 
+SHORTEST = 1e-3
+"""Time constant below which what follows does so at once where the tool stands [s]."""
+STOOD = 1e-6
+"""Way below which the tool stood [m]."""
+
 
 class View(eqx.Module):
     """How positions are seen: `shift` + `centre` + `turn` (x - `centre`), after what slips."""
@@ -97,6 +102,20 @@ class Moment(eqx.Module):
         """What a memory that follows at a rate [1/s] holds of each state by now; it began at rest."""
         until, since = (jnp.where(at <= self.time, jnp.exp(-rate * (self.time - at)), 0.0) for at in self._spans())
         return until - since
+
+    def left_behind(self, constant: Float[Array, ""]) -> Float[Array, ""]:
+        """Share of the step since the frame before that what follows with a time constant [s] still has to go.
+
+        It follows the tool's reported way; where the tool stood, it had all that time.
+        """
+        over = jnp.maximum(constant, SHORTEST)
+        ago = self.time - jnp.clip(self.report_times, self.time - self.gap, self.time)
+        lasted = ago[:-1] - ago[1:]
+        way = jnp.linalg.norm(jnp.diff(self.reports, axis=0), axis=1)
+        way = jnp.where(lasted > 0, way, 0.0)
+        left = constant / jnp.where(lasted > 0, lasted, 1.0) * (jnp.exp(-ago[1:] / over) - jnp.exp(-ago[:-1] / over))
+        stood = jnp.exp(-self.gap / over)
+        return (way @ left + STOOD * stood) / (jnp.sum(way) + STOOD)
 
     def _spans(self) -> tuple[Float[Array, " frames"], Float[Array, " frames"]]:
         return self.ended, jnp.where(self.ended <= self.time, self.began, jnp.inf)

@@ -22,6 +22,9 @@ FEWEST = 20
 """Fewest points that make a sheet."""
 OFTEN = 0.5
 """Share of the frames at rest in which a point must be seen to become a particle."""
+ASTRAY, FEW = 4.0, 0.25
+"""Times the usual square of the points' distances from where they mostly are, beyond which a frame at rest is left out,
+and the largest share of frames for which that holds: what is off more often is noise."""
 
 
 class PointTracker:
@@ -35,6 +38,8 @@ class PointTracker:
     def start(self, still: list[MeasuredPoints]) -> Sheet:
         """Lay the mesh over the mean of one or more frames at rest; stray points and rarely seen ones are left out.
 
+        So are a few frames in which the points lie elsewhere than in the others: something has moved already.
+
         Raises:
             PerceptionError: points without identities, or too few of them.
             MeshError: two sheets.
@@ -45,12 +50,14 @@ class PointTracker:
             rest_variance = np.full(len(self.ids), _rest_variance(self._declared, found, still[0].sd))
             sheet = Sheet(rest=self._declared.vertices, faces=self._declared.faces)
         else:
-            times = Counter(i for frame in found for i in frame)
-            ids = sorted(i for i, count in times.items() if count >= OFTEN * len(still))
+            ids = _often(found)
             if len(ids) < FEWEST:
                 raise PerceptionError(
                     f"{len(ids)} points are seen in half of the {len(still)} frames at rest; a sheet needs {FEWEST}."
                 )
+            found = _alike(found, np.asarray(ids))
+            times = Counter(i for frame in found for i in frame)
+            ids = [i for i in ids if times[i]]
             rest = np.array([np.mean([frame[i] for frame in found if i in frame], axis=0) for i in ids])
             self.ids = np.asarray(ids)
             flat = SheetPlane.through(rest).flatten(rest)
@@ -83,6 +90,21 @@ def _by_id(points: MeasuredPoints) -> dict[int, np.ndarray]:
         )
     seen = np.isfinite(points.positions).all(axis=1) & (points.track_id >= 0)
     return dict(zip(points.track_id[seen].tolist(), points.positions[seen], strict=True))
+
+
+def _often(found: list[dict[int, np.ndarray]]) -> list[int]:
+    """Identities that enough frames show, in order."""
+    times = Counter(i for frame in found for i in frame)
+    return sorted(i for i, count in times.items() if count >= OFTEN * len(found))
+
+
+def _alike(found: list[dict[int, np.ndarray]], ids: Int[np.ndarray, " n"]) -> list[dict[int, np.ndarray]]:
+    """Without a few frames in which the points are elsewhere than in most."""
+    positions = np.array([_positions(frame, ids) for frame in found])
+    squared = (positions - np.nanmedian(positions, axis=0)) ** 2
+    off = np.nansum(squared, axis=(1, 2)) / np.maximum(np.isfinite(squared).sum(axis=(1, 2)), 1)
+    astray = off > ASTRAY * np.median(off)
+    return [frame for frame, one in zip(found, astray, strict=True) if not one] if astray.mean() <= FEW else found
 
 
 def _positions(found: dict[int, np.ndarray], ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
