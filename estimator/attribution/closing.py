@@ -2,7 +2,7 @@
 
 Fit with what is declared, score every effect at what is left, fit again with each of the likeliest; of those that beat
 larger errors without a cause, make sense by their size and foretell what is left out of the fit better, keep the one
-that foretells it best. Again for a second and a third.
+that foretells it best, or the likeliest of those that do it about as well. Again for a second and a third.
 """
 
 from collections.abc import Callable
@@ -135,7 +135,7 @@ def close_the_loop(
                 say(f"{trial.effect.name} refused: {why}")
         if not passed:
             break
-        best = min(passed, key=lambda one: one.missed)
+        best = _best(passed)
         close = [one for one in passed if one is not best and _not_told_from(one, best)]
         refused += [
             (one, f"{best.effect.name} foretells better, to {1e3 * best.missed:.2f} mm against {1e3 * one.missed:.2f}")
@@ -202,6 +202,14 @@ def _likely(problem: Problem, found: list[Score]) -> list[Score]:
     confused = problem.sheet.effect(first.name).confounded_with
     near = [one for one in entering[LOOKED_AT:] if one.log_bayes_factor > COMPARED * first.log_bayes_factor]
     return entering[:LOOKED_AT] + [one for one in near if one.name in confused]
+
+
+def _best(passed: list[Trial]) -> Trial:
+    """The likeliest of those that foretell about as well as the one that does it best."""
+    if not passed[0].folds:
+        return max(passed, key=lambda one: one.log_bayes_factor)
+    least = min(one.missed for one in passed)
+    return max((one for one in passed if one.missed * BETTER <= least), key=lambda one: one.log_bayes_factor)
 
 
 def _not_told_from(one: Trial, best: Trial) -> bool:
