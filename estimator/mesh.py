@@ -105,3 +105,13 @@ def neighbour_table(near: sp.csr_matrix) -> Int[np.ndarray, "n p"]:
     place = np.arange(len(near.indices)) - np.repeat(near.indptr[:-1], degree)
     table[np.repeat(np.arange(len(degree)), degree), place] = near.indices
     return table
+
+
+def far_apart(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " _count"]:
+    """Indices of points far from one another, each the farthest from those before; begins far from the middle."""
+    chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)

@@ -16,6 +16,7 @@ from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.attribution.gather import gather
+from jiggle_mj.estimator.attribution.suggestion import suggest
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.eval.carrying import carry
@@ -39,6 +40,7 @@ def close_loop(
     *,
     truth: Path | None = None,
     library: tuple[Effect, ...] = LIBRARY,
+    suggestion: bool = False,
     overwrite: bool = False,
     allow_truncated: bool = False,
     on_frame: OnFrame = lambda observation, found: None,
@@ -51,6 +53,7 @@ def close_loop(
         directory: where discrepancy.json and discrepancy.html go.
         truth: a truth file, to score what is found attached before and after; looked at when all is decided.
         library: effects that are looked for; `(*LIBRARY, mine)` adds one.
+        suggestion: look for the pull that best tells apart what these frames cannot.
         overwrite: replace an earlier run's files.
         allow_truncated: use what is whole of a recording that was cut off.
         on_frame: called after each frame of the first estimate.
@@ -70,7 +73,7 @@ def close_loop(
     gathered = gather(recording.declaration, recording.camera, recording, config=EstimatorConfig(), on_frame=on_frame)
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(gathered, library=library, say=say)
-        found = made_by() | discrepancy(closed, gathered)
+        found = made_by() | discrepancy(closed, gathered, suggest(closed, gathered, say=say) if suggestion else None)
     sheet = gathered.estimator.sheet
     if truth is not None:
         true = read_truth(truth)

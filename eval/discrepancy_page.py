@@ -51,12 +51,26 @@ def story(found: Mapping[str, Any]) -> list[str]:
         if found["effects"]:
             numbers += f" before, {1e3 * held['after_rms_m']:.2f} mm after"
         told.append(f"The last part chose no effect; from what the tool says it is foretold to {numbers}.")
+    if found["suggestion"] is not None:
+        told.append(_next(found["suggestion"]))
     if not found["noise"]["still_frames"]:
         told.append(
             f"There are no still frames: noise of {1e3 * found['noise']['sd_m']:.2g} mm, and as much that neighbours "
             "share, was assumed."
         )
     return told
+
+
+def _next(suggestion: Mapping[str, Any]) -> str:
+    grasp, pull = (" ".join(f"{1e3 * one:.0f}" for one in suggestion[key]) for key in ("grasp_m", "pull_m"))
+    between = " and ".join(suggestion["between"])
+    expected = f"{suggestion['expected_log_bayes_factor']:.0f} nat"
+    if not suggestion["enough"]:
+        return f"No pull that was tried tells {between} apart: the best is expected to say {expected}."
+    return (
+        f"To tell {between} apart: grasp at {grasp} mm, pull by {pull} mm, and hold for {suggestion['hold_s']:.0f} s; "
+        f"that is expected to favour the right one by {expected}."
+    )
 
 
 def _size(value: float, sd: float, unit: str) -> str:

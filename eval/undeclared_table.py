@@ -91,7 +91,7 @@ OUTSIDE: dict[str, Disturbance] = {
     "grasp slips": GraspSlip(magnitude=0.006),
     "tissue yields": TissueYield(magnitude=0.1),
     "anchors yield": AnchorYield(magnitude=0.0015),
-    "anchors break": AnchorBreak(magnitude=0.006),
+    "anchors break": AnchorBreak(magnitude=0.01),
 }
 """What the library leaves out."""
 NOTHING = "nothing"

@@ -319,6 +319,7 @@ def close_loop(
     *,
     out: Out,
     truth: Path | None = None,
+    suggest: bool = False,
     allow_truncated: bool = False,
     overwrite: bool = False,
     as_json: AsJson = False,
@@ -329,6 +330,7 @@ def close_loop(
         recording: an MCAP file.
         out: folder for discrepancy.json and discrepancy.html.
         truth: a truth file, to score what is found attached before and after; opened when all is decided.
+        suggest: where several effects explain the frames, look for the next pull that tells them apart.
         allow_truncated: use what is whole of a recording that was cut off.
         overwrite: replace results that are already in the folder.
         as_json: print discrepancy.json to stdout.
@@ -344,6 +346,7 @@ def close_loop(
             recording,
             out,
             truth=truth,
+            suggestion=suggest,
             allow_truncated=allow_truncated,
             overwrite=overwrite,
             on_frame=on_frame,

@@ -14,6 +14,7 @@ from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.attribution.gather import assumed, gather
 from jiggle_mj.estimator.attribution.sheet import closed_on, held_way
 from jiggle_mj.estimator.attribution.still_noise import measure
+from jiggle_mj.estimator.attribution.suggestion import suggest, told_apart
 from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
@@ -82,7 +83,7 @@ def closed_over(observations: list[Observation]):
     gathered = gather(DECLARATION, None, observations)
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(gathered, library=SMALL)
-        return closed, discrepancy(closed, gathered)
+        return closed, discrepancy(closed, gathered), gathered
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +94,7 @@ def light():
 
 def test_an_undeclared_gravity_is_named_with_what_positions_cannot_tell_it_from(light):
     """A fifth of the weight and five times the stretching stiffness look alike but for bending."""
-    closed, found = light
+    closed, found, _ = light
     assert {found["effects"][0]["name"], *found["ambiguous_with"]} == {"gravity", "stretch"}, story(found)
     assert found["verdict"] == "ambiguous"
     trials = [*closed.accepted, *closed.rivals]
@@ -106,14 +107,14 @@ def test_an_undeclared_gravity_is_named_with_what_positions_cannot_tell_it_from(
 
 
 def test_nothing_is_named_where_nothing_is_missing():
-    _, found = closed_over(seen(1.0))
+    _, found, _ = closed_over(seen(1.0))
     assert found["verdict"] == "no-effect", story(found)
     assert not found["effects"]
     assert found["held_out"]["before_rms_m"] == found["held_out"]["after_rms_m"] < 3**0.5 * 2 * NOISE
 
 
 def test_a_tool_that_goes_further_than_it_says_is_named():
-    _, found = closed_over(seen(1.0, tool_scale=1.1))
+    _, found, _ = closed_over(seen(1.0, tool_scale=1.1))
     assert found["effects"][0]["name"] == "tool_scale", story(found)
     assert found["effects"][0]["theta"][0] == pytest.approx(np.log(1.1), abs=0.02)
     assert found["effects"][0]["this_session_alone"]
@@ -122,7 +123,7 @@ def test_a_tool_that_goes_further_than_it_says_is_named():
 def test_a_hold_that_slips_is_not_explained_by_larger_forces():
     """From the second increment of each lift on, the jaws have gone a centimetre further than what they hold."""
     slipped = [dataclasses.replace(one, tool=_further(one.tool)) if _late(one) else one for one in seen(1.0)]
-    _, found = closed_over(slipped)
+    _, found, _ = closed_over(slipped)
     assert found["left_over"][-1]["tool_variance"] > 10, story(found)
     assert found["verdict"] in ("unexplained", "effect-with-remainder"), story(found)
 
@@ -137,7 +138,7 @@ def _further(tool: ToolState) -> ToolState:
 
 
 def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
-    closed, found = light
+    closed, found, _ = light
     assert json.loads(json.dumps(found)) == found
     assert {"verdict", "effects", "ambiguous_with", "tested", "held_out", "localisation"} <= set(found)
     goes_with = found["localisation"]["goes_with"]
@@ -146,6 +147,21 @@ def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
         write_page(tmp_path / f"{name}.html", name="light", sheet=_sheet(closed), found=found)
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
     assert f"Added: {found['effects'][0]['name']}" in (tmp_path / "a.html").read_text()
+
+
+def test_a_pull_is_suggested_that_tells_more_than_the_first_lift_did(light):
+    closed, gathered = light[0], light[2]
+    with jax.enable_x64(True), one_thread():
+        found = suggest(closed, gathered)
+        assert found is not None and set(found.between) == {"gravity", "stretch"}
+        fits = [one.fitted for one in (closed.accepted[-1], *closed.rivals)]
+        first = [one for one in gathered.frames if one.grasp == 1]
+        assert found.expected > told_apart(closed.problem, fits, first) > 0
+        assert told_apart(closed.problem, [fits[0], fits[0]], first) == pytest.approx(0, abs=1)
+    assert np.linalg.norm(found.pull) <= max(np.linalg.norm(one.frame.way) for one in gathered.frames) + 1e-9
+    assert np.min(np.linalg.norm(sheet().rest - found.grasp, axis=1)) < 1e-3
+    told = discrepancy(closed, gathered, found)
+    assert ("To tell" in " ".join(story(told))) == found.enough
 
 
 @pytest.mark.parametrize(
@@ -163,7 +179,7 @@ def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
 )
 def test_an_effect_of_ones_own_is_tried_first(light, acts, says):
     mine = Effect(name="mine", acts=acts, units=("m",), prior_sd=(1e-3,), source="me")
-    problem, _ = light[0].problem, light[1]
+    problem = light[0].problem
     sheet_with = dataclasses.replace(problem.sheet, library=(mine,))
     with jax.enable_x64(True), pytest.raises(ValueError, match=says):
         check_effects(dataclasses.replace(problem, sheet=sheet_with))
@@ -226,5 +242,5 @@ def _sheet(closed):
 
 
 def test_attached_particles_stay_found(light):
-    closed, _ = light
+    closed = light[0]
     assert np.sum((closed.stages[-1].fitted.point.s > 0) != attached()) <= 2

@@ -172,6 +172,7 @@ def test_a_late_report_is_where_the_tool_was(plain, moment):
         ({"name": "a name"}, "letters, digits and underscores; got 'a name'"),
         ({"units": ("m", "m")}, "one entry for each parameter; got 2 and 1"),
         ({"prior_sd": (0.0,)}, "prior_sd must be above 0"),
+        ({"natural": (1.0, 2.0)}, "natural needs one entry for each parameter; got 2 for 1"),
     ],
 )
 def test_a_users_effect_is_checked(changed, says):

@@ -50,8 +50,11 @@ class Trial:
     fitted: Fitted
     log_bayes_factor: float
     """Against the fit without it, the lesser under either's weights."""
+    at: np.ndarray
+    """Which parameters are its own."""
     theta: np.ndarray
     sd: np.ndarray
+    """By the fit's own errors, or by how far parts left out change them, whichever is more."""
     left: Leftover | None = None
     folds: list[Foretold] | None = None
 
@@ -170,13 +173,24 @@ def _declared(problem: Problem, gathered: Gathered, used: set[int], say: Callabl
     states = np.array([one.state for one in gathered.frames])
     point = start(problem, np.zeros(problem.sheet.size), s, states, problem.frames(used))
     fitted = fit(problem, np.zeros(0, dtype=int), point, used, say=say)
-    return Stage(fitted=fitted, left=leftover(problem, fitted), folds=_folds(problem, fitted, used), scores=[])
+    folds = [foretell(problem, one, part) for part, one in _left_out(problem, fitted, used).items()]
+    return Stage(fitted=fitted, left=leftover(problem, fitted), folds=folds, scores=[])
 
 
-def _folds(problem: Problem, fitted: Fitted, used: set[int]) -> list[Foretold]:
-    if len(used) < 2:
-        return []
-    return [foretell(problem, without(problem, fitted, part), part) for part in sorted(used)]
+def _left_out(problem: Problem, fitted: Fitted, used: set[int]) -> dict[int, Fitted]:
+    """A fit without each part; none if there are fewer than two."""
+    return {part: without(problem, fitted, part) for part in sorted(used)} if len(used) > 1 else {}
+
+
+def _scatter(thetas: list[np.ndarray], size: int) -> np.ndarray:
+    """The jackknife's standard error of parameters [Miller 1974, doi:10.1093/biomet/61.1.1].
+
+    Grasps disagree by more than their noise where the model is wrong in other ways too.
+    """
+    if not thetas:
+        return np.zeros(size)
+    off = np.array(thetas) - np.mean(thetas, axis=0)
+    return np.sqrt((len(thetas) - 1) / len(thetas) * np.sum(off**2, axis=0))
 
 
 def _trials(
@@ -209,7 +223,7 @@ def _best(passed: list[Trial]) -> Trial:
     if not passed[0].folds:
         return max(passed, key=lambda one: one.log_bayes_factor)
     least = min(one.missed for one in passed)
-    return max((one for one in passed if one.missed * BETTER <= least), key=lambda one: one.log_bayes_factor)
+    return max((one for one in passed if one.missed * AS_GOOD <= least), key=lambda one: one.log_bayes_factor)
 
 
 def _not_told_from(one: Trial, best: Trial) -> bool:
@@ -229,7 +243,10 @@ def _not_told_from(one: Trial, best: Trial) -> bool:
 def _judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str], None]) -> Trial:
     """With what it leaves over and how it foretells."""
     left = leftover(problem, trial.fitted)
-    judged = replace(trial, left=left, folds=_folds(problem, trial.fitted, used))
+    fits = _left_out(problem, trial.fitted, used)
+    folds = [foretell(problem, one, part) for part, one in fits.items()]
+    thetas = [one.point.theta[trial.at] for one in fits.values()]
+    judged = replace(trial, left=left, folds=folds, sd=np.maximum(trial.sd, _scatter(thetas, len(trial.at))))
     foretold = f", foretells to {1e3 * judged.missed:.2f} mm" if judged.folds else ""
     say(f"{trial.effect.name} leaves {left.gain:.1f} nat to larger errors{foretold}")
     return judged
@@ -249,6 +266,7 @@ def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial],
         effect=effect,
         fitted=fitted,
         log_bayes_factor=float(gain),
+        at=at,
         theta=fitted.point.theta[at],
         sd=sd[-len(at) :],
     )

@@ -6,9 +6,10 @@ from jiggle_mj.estimator.attribution.closing import Closed, Trial
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold
 from jiggle_mj.estimator.attribution.localisation import localisation
+from jiggle_mj.estimator.attribution.suggestion import Suggestion
 
 
-def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
+def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | None = None) -> dict[str, Any]:
     """Numbers, strings and lists alone; lengths in metres, log Bayes factors in nat."""
     first, last = closed.stages[0], closed.stages[-1]
     noise, before = gathered.noise, localisation(closed.problem, first.fitted)
@@ -51,6 +52,7 @@ def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
         },
         "localisation": before,
         "localisation_after": localisation(closed.problem, last.fitted) if closed.accepted else before,
+        "suggestion": None if suggestion is None else _suggestion(suggestion),
         "detection_before": None,
         "detection_after": None,
     }
@@ -67,6 +69,17 @@ def _effect(closed: Closed, one: Trial) -> dict[str, Any]:
         "p_value": one.score.p_value,
         "this_session_alone": one.effect.sensing,
         "often_confused_with": list(one.effect.confounded_with),
+    }
+
+
+def _suggestion(found: Suggestion) -> dict[str, Any]:
+    return {
+        "grasp_m": found.grasp.tolist(),
+        "pull_m": found.pull.tolist(),
+        "hold_s": found.hold,
+        "between": list(found.between),
+        "expected_log_bayes_factor": found.expected,
+        "enough": found.enough,
     }
 
 

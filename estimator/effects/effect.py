@@ -47,6 +47,11 @@ class Effect:
                 f"Effect {self.name}: units and prior_sd need one entry for each parameter; got {len(self.units)} and "
                 f"{len(self.prior_sd)}."
             )
+        if self.natural is not None and len(self.natural) != len(self.prior_sd):
+            raise ValueError(
+                f"Effect {self.name}: natural needs one entry for each parameter; got {len(self.natural)} for "
+                f"{len(self.prior_sd)}."
+            )
         if not all(sd > 0 for sd in self.prior_sd):
             raise ValueError(f"Effect {self.name}: prior_sd must be above 0; got {self.prior_sd}.")
 

@@ -41,9 +41,10 @@ def _camera_drift(model: SheetModel, theta: Float[Array, " 6"], moment: Moment) 
 
 
 def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], moment: Moment) -> SheetModel:
-    """All is seen larger by a factor about a point that nobody knows: about the middle, and shifted."""
-    larger = eqx.tree_at(lambda one: one.view.turn, model, jnp.exp(theta[0]) * model.view.turn)
-    return eqx.tree_at(lambda one: one.view.shift, larger, larger.view.shift + theta[1:])
+    """All is seen larger by a factor about the camera, and that is somewhere beside the middle of the sheet."""
+    factor = jnp.exp(theta[0])
+    larger = eqx.tree_at(lambda one: one.view.turn, model, factor * model.view.turn)
+    return eqx.tree_at(lambda one: one.view.shift, larger, larger.view.shift + (1 - factor) * theta[1:])
 
 
 def _point_slip(model: SheetModel, theta: Float[Array, " 2"], moment: Moment) -> SheetModel:
@@ -146,7 +147,8 @@ SENSING = (
         name="depth_scale",
         acts=_depth_scale,
         units=("log factor", "m", "m", "m"),
-        prior_sd=(0.03, 5e-3, 5e-3, 5e-3),
+        prior_sd=(0.03, 0.15, 0.15, 0.15),
+        natural=(0.03, 0.0, 0.0, 0.15),
         source="a baseline that is wrong by 1 to 3 %, at a distance of 0.1 to 0.2 m",
         confounded_with=("camera_bias", "tool_scale", "pre_strain"),
         sensing=True,

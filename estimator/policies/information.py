@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.estimator import Estimator
-from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.mesh import SheetMesh, far_apart
 from jiggle_mj.estimator.outlook import Outcome, Outlook, Tug
 from jiggle_mj.estimator.policies.outcomes import outcomes
 from jiggle_mj.estimator.policies.policy import STEP, Policy
@@ -211,7 +211,7 @@ class Information(Policy):
         rest = estimator.sheet.rest
         if not self._worth:
             self._edge = SheetMesh(rest, estimator.sheet.faces).border
-            places = _spread(rest, PLACES)
+            places = far_apart(rest, PLACES)
             self._worth = dict.fromkeys(places[self._reached(estimator, rest[places])].tolist(), np.inf)
         probability = np.asarray(outlook.mixture.attached)
         few, many = self._drawn(outlook)
@@ -302,13 +302,3 @@ def underrated(outlook: Outlook, tug: Tug, s: Float[Array, "scenarios n"], *, le
 @eqx.filter_jit
 def _scenarios(outlook: Outlook, key: PRNGKeyArray, count: int, unknown: Float[Array, ""]) -> Float[Array, "count n"]:
     return outlook.scenarios(key, count, unknown=unknown)
-
-
-def _spread(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " _count"]:
-    """Indices of points far from one another, each the farthest from those before; begins far from the middle."""
-    chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
-    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(points)):
-        chosen.append(int(np.argmax(nearest)))
-        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return np.array(chosen)

@@ -1,0 +1,168 @@
+"""The next pull and hold that tells the surviving hypotheses apart, or the word that none does.
+
+A pull from each of several places is foretold by every hypothesis. What one foretells is held against what another
+shows, under the weights of the first: half the misfit is the log Bayes factor that the pull is expected to give in
+favour of the right one, with the attachments and sizes that each was fitted with [Box and Hill 1967,
+doi:10.1080/00401706.1967.10490441]. No pull goes further than the recording has gone.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise, permutations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, History, Timed
+from jiggle_mj.estimator.attribution.closing import Closed
+from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, weighed
+from jiggle_mj.estimator.attribution.gather import Gathered
+from jiggle_mj.estimator.attribution.problem import Point, Problem
+from jiggle_mj.estimator.attribution.sheet import look, predict_all
+from jiggle_mj.estimator.mesh import far_apart
+
+PLACES = 12
+"""Of grasps, spread over the sheet."""
+BEST = 3
+"""Places, best when lifted from, from which other directions are tried."""
+SLANTED = 0.5**0.5 * np.array([[1, 0, 1], [0, 1, 1], [-1, 0, 1], [0, -1, 1]], dtype=float)
+"""Directions beside straight up."""
+HOLD = 5.0
+"""How long what was pulled is held still [s]."""
+ENOUGH = 10.0
+"""What a pull must be expected to say [nat]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suggestion:
+    """A grasp, a pull and a hold."""
+
+    grasp: Float[np.ndarray, " 3"]
+    """Where the jaws close [m]."""
+    pull: Float[np.ndarray, " 3"]
+    """Where the tool goes from there [m]."""
+    hold: float
+    """How long it stays there [s]."""
+    expected: float
+    """Log Bayes factor for the right hypothesis against the wrong one that is told from it worst [nat]."""
+    between: tuple[str, ...]
+    """The hypotheses' effects."""
+
+    @property
+    def enough(self) -> bool:
+        """Whether it is worth the pull."""
+        return self.expected > ENOUGH
+
+
+def suggest(closed: Closed, gathered: Gathered, *, say: Callable[[str], None] = lambda _: None) -> Suggestion | None:
+    """Of the pulls that are tried, the one that is expected to tell most; None if there is nothing to tell apart."""
+    if not closed.rivals:
+        return None
+    trials = [closed.accepted[-1], *closed.rivals]
+    fits, names = [one.fitted for one in trials], tuple(one.effect.name for one in trials)
+    say(f"looking for a pull that tells {', '.join(names)} apart")
+    rest, far = gathered.estimator.sheet.rest, _farthest(gathered)
+    places = far_apart(rest, PLACES).tolist()
+
+    def tried(place: int, direction: Float[np.ndarray, " 3"]) -> tuple[float, int, Float[np.ndarray, " 3"]]:
+        frames = _frames(gathered, place, far * direction)
+        return told_apart(closed.problem, fits, frames), place, far * direction
+
+    best = sorted((tried(place, np.array([0.0, 0.0, 1.0])) for place in places), key=lambda one: -one[0])
+    best += [tried(place, direction) for _, place, _ in best[:BEST] for direction in SLANTED]
+    expected, place, pull = max(best, key=lambda one: one[0])
+    return Suggestion(grasp=rest[place], pull=pull, hold=HOLD, expected=expected, between=names)
+
+
+def told_apart(problem: Problem, fits: list[Fitted], frames: list[Timed]) -> float:
+    """What frames are expected to say for the right fit against the wrong one that comes closest to it [nat]."""
+    shown = [_shown(problem, one, frames) for one in fits]
+    return min(_against(problem, fits[k], shown[right]) for k, right in permutations(range(len(fits)), 2))
+
+
+def _shown(problem: Problem, fitted: Fitted, frames: list[Timed]) -> list[Timed]:
+    """The frames as they would be seen if a fit were right."""
+    rest = jnp.asarray(problem.history.rest)
+    moment = History(frames, np.asarray(rest)).moment(0, np.tile(rest, (len(frames), 1, 1)))
+    model = problem.sheet.model(jnp.asarray(fitted.point.theta), moment, jnp.zeros(3))
+    lying = look(model, rest)
+    frames = [replace(one, frame=eqx.tree_at(lambda f: (f.y, f.turned), one.frame, (lying, lying))) for one in frames]
+    seen = _predicted(_of(problem, frames), fitted, by_tool=True).seen
+    return [
+        replace(one, frame=eqx.tree_at(lambda f: f.y, one.frame, jnp.asarray(y)))
+        for one, y in zip(frames, seen, strict=True)
+    ]
+
+
+def _predicted(problem: Problem, fitted: Fitted, *, by_tool: bool) -> Point:
+    theta, s = fitted.point.theta, fitted.point.s
+    states = np.tile(np.asarray(problem.history.rest), (len(problem.history.frames), 1, 1))
+    states, _ = predict_all(problem.sheet, theta, s, problem.history, states, by_tool=by_tool)
+    states, seen = predict_all(problem.sheet, theta, s, problem.history, states, by_tool=by_tool)
+    return Point(theta=theta, s=s, states=states, seen=seen)
+
+
+def _against(problem: Problem, fitted: Fitted, frames: list[Timed]) -> float:
+    """By how much frames speak against a fit [nat]."""
+    there = _of(problem, frames)
+    point = _predicted(there, fitted, by_tool=False)
+    return 0.5 * cost_under(there, weighed(there, point, list(range(len(frames)))), point)
+
+
+def _of(problem: Problem, frames: list[Timed]) -> Problem:
+    return replace(problem, history=History(frames, np.asarray(problem.history.rest)))
+
+
+def _frames(gathered: Gathered, place: int, pull: Float[np.ndarray, " 3"]) -> list[Timed]:
+    """The jaws closed on a place, half of the pull, all of it, and after the hold; what is seen is left open."""
+    rest = gathered.estimator.sheet.rest
+    last, gap = gathered.frames[-1], _usual_gap(gathered.frames)
+    held = np.linalg.norm(rest - rest[place], axis=1) <= _reach(gathered)
+    like = last.frame
+    precision = jnp.broadcast_to(jnp.max(like.precision, axis=0)[None], like.precision.shape)
+    grasp, began = last.grasp + 1, last.time + HOLD
+    moves = [(0.0, 0.0), (gap, 0.5), (2 * gap, 1.0), (2 * gap + HOLD, 1.0)]
+    return [
+        Timed(
+            frame=ClosedFrame(
+                y=jnp.asarray(rest),
+                visible=jnp.ones(len(rest), dtype=bool),
+                precision=precision,
+                held=jnp.asarray(held),
+                loaded=jnp.asarray(gathered.estimator.loaded(held)),
+                turned=jnp.asarray(rest),
+                way=jnp.asarray(share * pull),
+                by_points=jnp.asarray(False),
+                held_sd=like.held_sd,
+            ),
+            index=last.index + 1 + k,
+            grasp=grasp,
+            part=last.part + 1,
+            time=began + since,
+            closed=since,
+            state=rest,
+            reports=((began + since, share * pull),),
+        )
+        for k, (since, share) in enumerate(moves)
+    ]
+
+
+def _farthest(gathered: Gathered) -> float:
+    """How far the tool has gone from where it closed [m]."""
+    return max(float(np.linalg.norm(one.frame.way)) for one in gathered.frames)
+
+
+def _usual_gap(frames: list[Timed]) -> float:
+    """Between frames of a grasp, in the median [s]."""
+    return float(np.median([b.time - a.time for a, b in pairwise(frames) if a.grasp == b.grasp]))
+
+
+def _reach(gathered: Gathered) -> float:
+    """Farthest that a held particle is from the middle of those held [m]."""
+    rest = gathered.estimator.sheet.rest
+
+    def radius(held: Bool[np.ndarray, " n"]) -> float:
+        return float(np.linalg.norm(rest[held] - rest[held].mean(axis=0), axis=1).max())
+
+    return max(radius(np.asarray(one.frame.held)) for one in gathered.frames)
