@@ -15,6 +15,7 @@ from jiggle_mj.estimator.attribution.gather import assumed, gather
 from jiggle_mj.estimator.attribution.sheet import closed_on, held_way
 from jiggle_mj.estimator.attribution.still_noise import measure
 from jiggle_mj.estimator.attribution.suggestion import suggest, told_apart
+from jiggle_mj.estimator.attribution.trials import jackknife_sd
 from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
@@ -183,6 +184,13 @@ def test_an_effect_of_ones_own_is_tried_first(light, acts, says):
     sheet_with = dataclasses.replace(problem.sheet, library=(mine,))
     with jax.enable_x64(True), pytest.raises(ValueError, match=says):
         check_effects(dataclasses.replace(problem, sheet=sheet_with))
+
+
+def test_the_jackknife_of_a_mean_is_its_standard_error():
+    values = np.random.default_rng(0).normal(size=(7, 2))
+    means = [np.delete(values, k, axis=0).mean(axis=0) for k in range(7)]
+    np.testing.assert_allclose(jackknife_sd(means, 2), values.std(axis=0, ddof=1) / np.sqrt(7))
+    np.testing.assert_array_equal(jackknife_sd([], 2), np.zeros(2))
 
 
 def test_noise_is_measured_from_still_frames_with_its_smooth_part():

@@ -2,11 +2,12 @@
 
 from typing import Any
 
-from jiggle_mj.estimator.attribution.closing import Closed, Trial
+from jiggle_mj.estimator.attribution.closing import Closed
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold
 from jiggle_mj.estimator.attribution.localisation import localisation
 from jiggle_mj.estimator.attribution.suggestion import Suggestion
+from jiggle_mj.estimator.attribution.trials import Trial
 
 
 def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | None = None) -> dict[str, Any]:

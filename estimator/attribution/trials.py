@@ -1,0 +1,145 @@
+"""Effects fitted to what is left: which are tried, from where, and how well each foretells what it never saw."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, fit, gains_over, moved, without
+from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
+from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
+from jiggle_mj.estimator.attribution.problem import Point, Problem
+from jiggle_mj.estimator.attribution.scores import Score, occam, scores
+from jiggle_mj.estimator.effects import Effect
+
+LOOKED_AT = 3
+"""Effects that are fitted, the likeliest by their scores."""
+ENTER = 10.0
+"""Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
+COMPARED = 0.5
+"""Share of the best log Bayes factor from which effects are compared by what they foretell; and fitted, if often
+confused with the best."""
+ABSURD = 3.5
+"""Prior standard deviations beyond which a parameter makes no sense."""
+START = 2.0
+"""Prior standard deviations within which a fit begins."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """An effect, fitted."""
+
+    score: Score
+    effect: Effect
+    fitted: Fitted
+    log_bayes_factor: float
+    """Against the fit without it, the lesser under either's weights."""
+    at: np.ndarray
+    """Which parameters are its own."""
+    theta: np.ndarray
+    sd: np.ndarray
+    """By the fit's own errors, or by how far parts left out change them, whichever is more."""
+    left: Leftover | None = None
+    folds: list[Foretold] | None = None
+
+    @property
+    def missed(self) -> float:
+        """Root mean square error over all parts left out [m]; without any, the less the likelier."""
+        return Foretold.together(self.folds).rms if self.folds else -self.log_bayes_factor
+
+    @property
+    def sensible(self) -> bool:
+        """Whether its size is."""
+        return bool(np.all(np.abs(self.theta) <= ABSURD * np.asarray(self.effect.prior_sd)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """The loop before or after an effect was added."""
+
+    fitted: Fitted
+    left: Leftover
+    folds: list[Foretold]
+    """Each part that was fitted to, foretold by a fit without it; none if there are fewer than two."""
+    scores: list[Score]
+
+
+def fitted_trials(
+    problem: Problem, stage: Stage, accepted: list[Trial], used: set[int], say: Callable[[str], None]
+) -> list[Trial]:
+    """The likeliest effects, fitted, the best first, as far as they are worth a look."""
+    found = scores(problem, stage.fitted)
+    stage.scores.extend(found)
+    say("scores: " + ", ".join(f"{one.name} {one.log_bayes_factor:.1f}" for one in found[:6]))
+    trials = [_fitted(problem, stage, one, accepted, used) for one in _likely(problem, found)]
+    for one in trials:
+        say(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
+    trials = [one for one in trials if one.log_bayes_factor > ENTER]
+    return sorted(trials, key=lambda one: (not one.sensible, -one.log_bayes_factor))
+
+
+def _likely(problem: Problem, found: list[Score]) -> list[Score]:
+    """Those worth a fit: the likeliest, and what the first of them is often confused with, if it is not far behind."""
+    entering = [one for one in found if one.log_bayes_factor > ENTER]
+    if not entering:
+        return []
+    first = entering[0]
+    confused = problem.sheet.effect(first.name).confounded_with
+    near = [one for one in entering[LOOKED_AT:] if one.log_bayes_factor > COMPARED * first.log_bayes_factor]
+    return entering[:LOOKED_AT] + [one for one in near if one.name in confused]
+
+
+def judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str], None]) -> Trial:
+    """With what it leaves over and how it foretells."""
+    left = leftover(problem, trial.fitted)
+    fits = left_out(problem, trial.fitted, used)
+    folds = [foretell(problem, one, part) for part, one in fits.items()]
+    thetas = [one.point.theta[trial.at] for one in fits.values()]
+    found = replace(trial, left=left, folds=folds, sd=np.maximum(trial.sd, jackknife_sd(thetas, len(trial.at))))
+    foretold = f", foretells to {1e3 * found.missed:.2f} mm" if found.folds else ""
+    say(f"{trial.effect.name} leaves {left.gain:.1f} nat to larger errors{foretold}")
+    return found
+
+
+def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial], used: set[int]) -> Trial:
+    effect = problem.sheet.effect(score.name)
+    at = problem.sheet.place(effect.name, score.site)
+    named = np.concatenate([*(problem.sheet.place(one.effect.name, one.score.site) for one in accepted), at])
+    before = stage.fitted
+    point = _stepped(problem, before, effect, at, score) if score.began is None else score.began
+    fitted = fit(problem, named.astype(int), point, used)
+    volume, sd = occam(problem, fitted)
+    gain = min(gains_over(problem, fitted, before)) - (volume - occam(problem, before)[0]) - np.log(effect.sites)
+    return Trial(
+        score=score,
+        effect=effect,
+        fitted=fitted,
+        log_bayes_factor=float(gain),
+        at=at,
+        theta=fitted.point.theta[at],
+        sd=sd[-len(at) :],
+    )
+
+
+def _stepped(problem: Problem, before: Fitted, effect: Effect, at: np.ndarray, score: Score) -> Point:
+    """From where there is no such effect by a linear step, unless that leads astray."""
+    limit = START * problem.prior_sd[at]
+    step = np.clip(before.point.theta[at] + score.theta, 0.0 if effect.non_negative else -limit, limit)
+    point = moved(problem, before, at, step)
+    return before.point if cost_under(problem, before.weights, point) > before.cost else point
+
+
+def left_out(problem: Problem, fitted: Fitted, used: set[int]) -> dict[int, Fitted]:
+    """A fit without each part; none if there are fewer than two."""
+    return {part: without(problem, fitted, part) for part in sorted(used)} if len(used) > 1 else {}
+
+
+def jackknife_sd(thetas: list[np.ndarray], size: int) -> np.ndarray:
+    """The jackknife's standard error of parameters, of fits without one part each; zero if there is none.
+
+    Grasps disagree by more than their noise where the model is wrong in other ways too [Miller 1974,
+    doi:10.1093/biomet/61.1.1].
+    """
+    if not thetas:
+        return np.zeros(size)
+    off = np.array(thetas) - np.mean(thetas, axis=0)
+    return np.sqrt((len(thetas) - 1) / len(thetas) * np.sum(off**2, axis=0))
