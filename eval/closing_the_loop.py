@@ -80,8 +80,8 @@ def close_loop(
         if true.identity != recording.metadata.get("identity", ""):
             raise RecordingError(f"{truth} is not the truth of {recording_path}.")
         last = gathered.frames[-1].index
-        for when, stage in (("before", closed.stages[0]), ("after", closed.stages[-1])):
-            found[f"detection_{when}"] = _scored(sheet, stage.fitted.point.s > 0, true, last)
+        for when, fitted in (("before", closed.stages[0].fitted), ("after", closed.final)):
+            found[f"detection_{when}"] = _scored(sheet, fitted.point.s > 0, true, last)
     name = recording.metadata.get("name", recording_path.stem)
     (directory / DISCREPANCY).write_text(json.dumps(found, indent=1) + "\n")
     write_page(directory / PAGE, name=name, sheet=sheet, found=found)

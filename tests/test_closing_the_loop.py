@@ -114,6 +114,7 @@ def test_nothing_is_named_where_nothing_is_missing():
     assert found["held_out"]["before_rms_m"] == found["held_out"]["after_rms_m"] < 3**0.5 * 2 * NOISE
 
 
+@pytest.mark.slow
 def test_a_tool_that_goes_further_than_it_says_is_named():
     _, found, _ = closed_over(seen(1.0, tool_scale=1.1))
     assert found["effects"][0]["name"] == "tool_scale", story(found)
@@ -156,7 +157,7 @@ def test_a_pull_is_suggested_that_tells_more_than_the_first_lift_did(light):
         found = suggest(closed, gathered)
         assert found is not None and set(found.between) == {"gravity", "stretch"}
         fits = [one.fitted for one in (closed.accepted[-1], *closed.rivals)]
-        first = [one for one in gathered.frames if one.grasp == 1]
+        first = [one for one in gathered.frames if one.grasp == 1][:4]
         assert found.expected > told_apart(closed.problem, fits, first) > 0
         assert told_apart(closed.problem, [fits[0], fits[0]], first) == pytest.approx(0, abs=1)
     assert np.linalg.norm(found.pull) <= max(np.linalg.norm(one.frame.way) for one in gathered.frames) + 1e-9

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from jiggle_mj.estimator.attribution.fit import STIFFEST, fit, start
+from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, fit, start
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import leftover
@@ -57,6 +57,9 @@ class Closed:
     refused: list[tuple[Trial, str]]
     stages: list[Stage]
     """The first with what is declared alone."""
+    final: Fitted
+    """The last stage's fit; where something is left over, again with errors as large as that takes, so that nothing is
+    called attached for a cause that has no name."""
     reported: tuple[Foretold, Foretold] | None
     """A part that chose no effect, foretold before and after; None if there was none to spare."""
     problem: Problem
@@ -113,12 +116,19 @@ def close_the_loop(
     if spare is not None:
         before = foretell(problem, stages[0].fitted, spare)
         reported = before, foretell(problem, stages[-1].fitted, spare) if accepted else before
+    verdict, last = _verdict(accepted, rivals, stages[-1], reported), stages[-1]
+    final = last.fitted
+    if verdict in ("unexplained", "effect-with-remainder"):
+        say("fitting again with larger errors, for what is left over")
+        wider = problem.widened(last.left.variance, last.left.amplitude * problem.amplitude)
+        final = fit(wider, final.named, final.point, used)
     return Closed(
-        verdict=_verdict(accepted, rivals, stages[-1], reported),
+        verdict=verdict,
         accepted=accepted,
         rivals=rivals,
         refused=refused,
         stages=stages,
+        final=final,
         reported=reported,
         problem=problem,
     )
