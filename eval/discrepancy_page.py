@@ -51,6 +51,8 @@ def story(found: Mapping[str, Any]) -> list[str]:
         if found["effects"]:
             numbers += f" before, {1e3 * held['after_rms_m']:.2f} mm after"
         told.append(f"The last part chose no effect; from what the tool says it is foretold to {numbers}.")
+        still, shared = (f"{1e3 * held[f'{name}_rms_m']:.2f} mm" for name in ("unmoved", "in_proportion"))
+        told.append(f"Without a model: {still} if nothing moved, {shared} if each particle went its share of the way.")
     if found["suggestion"] is not None:
         told.append(_next(found["suggestion"]))
     if not found["noise"]["still_frames"]:
@@ -115,7 +117,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         subplot_titles=(
             "mean miss on the sheet, before [mm]; ringed: found attached",
             "after [mm]",
-            "log Bayes factor of each effect, one linear step [nat]",
+            "log Bayes factor of each effect, one step from the fit [nat]",
             "what the miss goes with (rank correlation), before and after",
             "miss of each fitted frame [mm]",
             "parts left out of the fit, then one that chose no effect [mm]",

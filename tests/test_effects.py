@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jiggle_mj.estimator.effects import LIBRARY, Effect
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, centred, tangents, undisturbed
+from jiggle_mj.estimator.effects.sheet_model import STOOD, Moment, SheetModel, centred, tangents, undisturbed
 from jiggle_mj.estimator.environment import Weight
 from jiggle_mj.estimator.membrane import TriangleMembrane
 from small_sheet import DECLARATION, lifts, sheet, sheet_energy
@@ -120,10 +120,11 @@ def test_what_lags_still_has_to_go_what_an_exponential_leaves(moment):
     still = eqx.tree_at(lambda m: m.reports, moment, jnp.asarray(np.outer([0.0, 1.0, 1.0, 3.0], WAY)))
     with jax.enable_x64(True):
         constant = jnp.asarray(lag)
-        assert float(moment.left_behind(constant)) == pytest.approx(even, rel=1e-3)
-        late = lag / half * (np.exp(-half / lag) - np.exp(-gap / lag))
-        assert float(stood.left_behind(constant)) == pytest.approx(late, rel=1e-3)
-        assert float(still.left_behind(constant)) == pytest.approx(np.exp(-gap / lag), rel=1e-3)
+        stays, share = np.exp(-gap / lag), STOOD / (STOOD + np.linalg.norm(WAY))
+        assert float(moment.left_behind(constant)) == pytest.approx((1 - share) * even + share * stays)
+        late = lag / half * (np.exp(-half / lag) - stays)
+        assert float(stood.left_behind(constant)) == pytest.approx((1 - share) * late + share * stays)
+        assert float(still.left_behind(constant)) == pytest.approx(stays)
 
 
 def test_damped_tissue_resists_what_it_does_since_the_frame_before(plain, moment):
@@ -172,7 +173,7 @@ def test_a_late_report_is_where_the_tool_was(plain, moment):
         ({"name": "a name"}, "letters, digits and underscores; got 'a name'"),
         ({"units": ("m", "m")}, "one entry for each parameter; got 2 and 1"),
         ({"prior_sd": (0.0,)}, "prior_sd must be above 0"),
-        ({"natural": (1.0, 2.0)}, "natural needs one entry for each parameter; got 2 for 1"),
+        ({"natural": ((1.0, 2.0),)}, "each start in natural needs 1 parameters"),
     ],
 )
 def test_a_users_effect_is_checked(changed, says):

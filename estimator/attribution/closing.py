@@ -52,14 +52,14 @@ class Closed:
     verdict: str
     """no-effect, effect, ambiguous, effect-with-remainder or unexplained."""
     accepted: list[Trial]
-    rivals: list[Trial]
-    """Effects that one of those accepted could not be told from."""
+    rivals: list[list[Trial]]
+    """Of each of those accepted: effects that it could not be told from."""
     refused: list[tuple[Trial, str]]
     stages: list[Stage]
     """The first with what is declared alone."""
     final: Fitted
-    """The last stage's fit; where something is left over, again with errors as large as that takes, so that nothing is
-    called attached for a cause that has no name."""
+    """The last stage's fit; where something is left over, again with force errors and fields as large as that takes, so
+    that less is called attached for a cause that has no name."""
     reported: tuple[Foretold, Foretold] | None
     """A part that chose no effect, foretold before and after; None if there was none to spare."""
     problem: Problem
@@ -102,16 +102,14 @@ def close_the_loop(
             break
         best = _best(passed)
         close = [one for one in passed if one is not best and _not_told_from(one, best)]
-        refused += [
-            (one, f"{best.effect.name} foretells better, to {1e3 * best.missed:.2f} mm against {1e3 * one.missed:.2f}")
-            for one in passed
-            if one is not best and one not in close
-        ]
+        refused += [(one, _behind(one, best)) for one in passed if one is not best and one not in close]
         accepted.append(best)
-        rivals += close
+        rivals.append(close)
         assert best.left is not None and best.folds is not None
         stages.append(Stage(fitted=best.fitted, left=best.left, folds=best.folds, scores=[]))
         say(f"{best.effect.name} added")
+    added = {one.effect.name for one in accepted}
+    rivals = [[one for one in group if one.effect.name not in added] for group in rivals]
     reported = None
     if spare is not None:
         before = foretell(problem, stages[0].fitted, spare)
@@ -154,6 +152,13 @@ def _best(passed: list[Trial]) -> Trial:
     return max((one for one in passed if one.missed * AS_GOOD <= least), key=lambda one: one.log_bayes_factor)
 
 
+def _behind(one: Trial, best: Trial) -> str:
+    """Why an effect is neither added nor named beside the best."""
+    if best.folds and best.missed < one.missed * AS_GOOD:
+        return f"{best.effect.name} foretells better, to {1e3 * best.missed:.2f} mm against {1e3 * one.missed:.2f}"
+    return f"{best.effect.name} is likelier by {best.log_bayes_factor - one.log_bayes_factor:.0f} nat"
+
+
 def _not_told_from(one: Trial, best: Trial) -> bool:
     """Whether an effect explains as much as the best, and foretells what was left out about as well.
 
@@ -186,7 +191,7 @@ def _against(best: Trial, stage: Stage) -> str | None:
 
 
 def _verdict(
-    accepted: list[Trial], rivals: list[Trial], last: Stage, reported: tuple[Foretold, Foretold] | None
+    accepted: list[Trial], rivals: list[list[Trial]], last: Stage, reported: tuple[Foretold, Foretold] | None
 ) -> str:
     missed = [Foretold.together(last.folds)] if last.folds else []
     missed += [] if reported is None else [reported[1]]
@@ -195,4 +200,4 @@ def _verdict(
         return "unexplained" if left_over else "no-effect"
     if left_over:
         return "effect-with-remainder"
-    return "ambiguous" if rivals else "effect"
+    return "ambiguous" if any(rivals) else "effect"

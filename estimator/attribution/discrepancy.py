@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
 from jiggle_mj.estimator.attribution.closing import Closed
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold
@@ -17,7 +18,7 @@ def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | Non
     return {
         "verdict": closed.verdict,
         "effects": [_effect(closed, one) for one in closed.accepted],
-        "ambiguous_with": [one.effect.name for one in closed.rivals],
+        "ambiguous_with": list(dict.fromkeys(one.effect.name for rivals in closed.rivals for one in rivals)),
         "refused": [{"name": one.effect.name, "why": why} for one, why in closed.refused],
         "tested": [effect.name for effect in closed.problem.sheet.library],
         "scores": [
@@ -44,6 +45,7 @@ def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | Non
                 for before, after in zip(first.folds, last.folds, strict=True)
             ],
             **_reported(closed.reported),
+            **_baselines(closed, gathered),
         },
         "noise": {
             "sd_m": noise.sd,
@@ -52,7 +54,7 @@ def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | Non
             "still_frames": noise.frames,
         },
         "localisation": before,
-        "localisation_after": localisation(closed.problem, last.fitted) if closed.accepted else before,
+        "localisation_after": before if closed.final is first.fitted else localisation(closed.problem, closed.final),
         "suggestion": None if suggestion is None else _suggestion(suggestion),
         "detection_before": None,
         "detection_after": None,
@@ -70,6 +72,15 @@ def _effect(closed: Closed, one: Trial) -> dict[str, Any]:
         "p_value": one.score.p_value,
         "this_session_alone": one.effect.sensing,
         "often_confused_with": list(one.effect.confounded_with),
+    }
+
+
+def _baselines(closed: Closed, gathered: Gathered) -> dict[str, float | None]:
+    """Of the same grasp, without a model."""
+    spare = None if closed.reported is None else gathered.frames[-1].part
+    return {
+        f"{name}_rms_m": None if spare is None else of(gathered.frames, spare)
+        for name, of in (("unmoved", unmoved), ("in_proportion", in_proportion))
     }
 
 

@@ -23,7 +23,7 @@ ODDS = 2.2
 STIFFEST = 0.98
 """Largest bounded stiffness."""
 DIRECTIONS = 20
-"""Most parameters that are fitted together."""
+"""Parameters that are fitted together, in most fits at most."""
 PASSES = 10
 """Most Gauss-Newton steps."""
 SHORTER = (1.0, 0.4, 0.15, 0.05)
@@ -147,9 +147,9 @@ def _shortened(
     return None
 
 
-def directions(problem: Problem, free: np.ndarray, width: int) -> Float[np.ndarray, "p width"]:
-    """Unit vectors along parameters, padded."""
-    along = np.zeros((problem.sheet.size, width))
+def directions(problem: Problem, free: np.ndarray, width: int) -> Float[np.ndarray, "p d"]:
+    """Unit vectors along parameters, padded to a width that most fits share, so that they are compiled once."""
+    along = np.zeros((problem.sheet.size, max(width, len(free))))
     along[free, np.arange(len(free))] = 1
     return along
 

@@ -56,8 +56,8 @@ class Problem:
             prior=prior_belief(mesh, reference=float(balance.reference)),
             noise=gathered.fields,
             prior_sd=np.concatenate([np.tile(effect.prior_sd, effect.sites) for effect in library]),
-            own=np.concatenate([sheet.place(name) for name in own]).astype(int),
-            own_sd=np.concatenate([np.asarray(sd) for sd in own.values()]),
+            own=np.concatenate([[], *(sheet.place(name) for name in own)]).astype(int),
+            own_sd=np.concatenate([[], *(np.asarray(sd) for sd in own.values())]),
         )
 
     def widened(self, variance: float, amplitude: float) -> "Problem":

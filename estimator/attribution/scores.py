@@ -5,15 +5,15 @@ force fields are marginalised, g its score and theta ~ N(0, Theta) before,
 
     ln BF = g^T (V + Theta^-1)^-1 g / 2 - ln |I + Theta V| / 2
 
-for each place where it may be, and the mean of the BFs over the places. An effect that does not show in its derivatives
-at 0 is also tried from its natural size, with a few steps of a fit.
+for each place where it may be, and the mean of the BFs over the places. An effect that shows little of
+itself in its derivatives at 0 is also tried from its natural size, with a few steps of a fit.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.fit import Fitted, fit, gains_over, linearised, moved
+from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, fit, gains_over, linearised, moved
 from jiggle_mj.estimator.attribution.normal_equations import reduced, without_stiffnesses
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects.effect import Effect
@@ -35,11 +35,12 @@ class Score:
     theta: Float[np.ndarray, " p"]
     """By how much its parameters there would change, in that step."""
     p_value: float
-    """Of the score statistic where the effect is absent, for the best of all its places."""
+    """Of the score statistic where the effect is absent, for the best of all its places; of the likelihood ratio, where
+    it was tried from its natural size."""
     began: Point | None = None
     """Where a fit with it may begin, if not with that step."""
     kept: float
-    """Share of the information about it that is left in the worst direction when the rest is marginalised."""
+    """Share of the information about it that is left in the worst direction when the rest is marginalised, at 0."""
 
 
 def scores(problem: Problem, fitted: Fitted) -> list[Score]:
@@ -103,16 +104,24 @@ def _one(
 def _where_natural(problem: Problem, fitted: Fitted, score: Score) -> Score:
     """An effect's score, or that of a few steps from its natural size, where that is more."""
     effect = problem.sheet.effect(score.name)
-    if effect.natural is None:
+    if not effect.natural:
         return score
     at = problem.sheet.place(effect.name, score.site)
     parts = {problem.history.frames[k].part for k in fitted.glances}
-    begun = moved(problem, fitted, at, np.array(effect.natural))
-    found = fit(problem, np.append(fitted.named, at), begun, parts, passes=STEPS)
-    gain = min(gains_over(problem, found, fitted)) - occam(problem, found)[0] + occam(problem, fitted)[0]
+    begun = [moved(problem, fitted, at, np.array(one)) for one in effect.natural]
+    best = min(begun, key=lambda point: cost_under(problem, fitted.weights, point))
+    found = fit(problem, np.append(fitted.named, at), best, parts, passes=STEPS)
+    likelier = min(gains_over(problem, found, fitted))
+    gain = likelier - occam(problem, found)[0] + occam(problem, fitted)[0] - np.log(effect.sites)
     if gain <= score.log_bayes_factor:
         return score
-    return replace(score, log_bayes_factor=float(gain), theta=found.point.theta[at], began=found.point)
+    return replace(
+        score,
+        log_bayes_factor=float(gain),
+        theta=found.point.theta[at],
+        p_value=float(chi2.sf(2 * max(likelier, 0.0), len(at))),
+        began=found.point,
+    )
 
 
 def _best(sites: list[Score]) -> Score:

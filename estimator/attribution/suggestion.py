@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, History, Timed
+from jiggle_mj.estimator.attribution.closed_frames import USUAL_GAP, ClosedFrame, History, Timed
 from jiggle_mj.estimator.attribution.closing import Closed
 from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, weighed
 from jiggle_mj.estimator.attribution.gather import Gathered
@@ -57,9 +57,10 @@ class Suggestion:
 
 def suggest(closed: Closed, gathered: Gathered, *, say: Callable[[str], None] = lambda _: None) -> Suggestion | None:
     """Of the pulls that are tried, the one that is expected to tell most; None if there is nothing to tell apart."""
-    if not closed.rivals:
+    open_ = [[best, *rivals] for best, rivals in zip(closed.accepted, closed.rivals, strict=True) if rivals]
+    if not open_:
         return None
-    trials = [closed.accepted[-1], *closed.rivals]
+    trials = open_[-1]
     fits, names = [one.fitted for one in trials], tuple(one.effect.name for one in trials)
     say(f"looking for a pull that tells {', '.join(names)} apart")
     rest, far = gathered.estimator.sheet.rest, _farthest(gathered)
@@ -88,7 +89,8 @@ def _shown(problem: Problem, fitted: Fitted, frames: list[Timed]) -> list[Timed]
     model = problem.sheet.model(jnp.asarray(fitted.point.theta), moment, jnp.zeros(3))
     lying = look(model, rest)
     frames = [replace(one, frame=eqx.tree_at(lambda f: (f.y, f.turned), one.frame, (lying, lying))) for one in frames]
-    seen = _predicted(_of(problem, frames), fitted, by_tool=True).seen
+    told = [replace(one, frame=eqx.tree_at(lambda f: f.by_points, one.frame, jnp.asarray(False))) for one in frames]
+    seen = _predicted(_of(problem, told), fitted, by_tool=True).seen
     return [
         replace(one, frame=eqx.tree_at(lambda f: f.y, one.frame, jnp.asarray(y)))
         for one, y in zip(frames, seen, strict=True)
@@ -133,7 +135,7 @@ def _frames(gathered: Gathered, place: int, pull: Float[np.ndarray, " 3"]) -> li
                 loaded=jnp.asarray(gathered.estimator.loaded(held)),
                 turned=jnp.asarray(rest),
                 way=jnp.asarray(share * pull),
-                by_points=jnp.asarray(False),
+                by_points=like.by_points,
                 held_sd=like.held_sd,
             ),
             index=last.index + 1 + k,
@@ -155,7 +157,7 @@ def _farthest(gathered: Gathered) -> float:
 
 def _usual_gap(frames: list[Timed]) -> float:
     """Between frames of a grasp, in the median [s]."""
-    return float(np.median([b.time - a.time for a, b in pairwise(frames) if a.grasp == b.grasp]))
+    return float(np.median([b.time - a.time for a, b in pairwise(frames) if a.grasp == b.grasp] or [USUAL_GAP]))
 
 
 def _reach(gathered: Gathered) -> float:

@@ -136,6 +136,8 @@ def left_out(problem: Problem, fitted: Fitted, used: set[int]) -> dict[int, Fitt
 def jackknife_sd(thetas: list[np.ndarray], size: int) -> np.ndarray:
     """The jackknife's standard error of parameters, of fits without one part each; zero if there is none.
 
+    Such a fit is one step from the whole one, so that it says the least.
+
     Grasps disagree by more than their noise where the model is wrong in other ways too [Miller 1974,
     doi:10.1093/biomet/61.1.1].
     """

@@ -56,5 +56,5 @@ def _check(effect: Effect, plain: SheetModel, moment: Moment, x: jax.Array) -> N
     if not np.isfinite(derivative).all():
         bad = np.flatnonzero(~np.isfinite(derivative).all(axis=0)).tolist()
         raise ValueError(f"Effect {effect.name}: no finite derivative at 0 along the parameters {bad}.")
-    if not derivative.any():
+    if not (derivative.any() or effect.natural):
         raise ValueError(f"Effect {effect.name} changes neither forces, anchors, tool nor view to first order.")

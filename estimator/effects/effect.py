@@ -27,8 +27,8 @@ class Effect:
     sites: int = 1
     """At how many places, or in how many directions, it may be, at one of them alone; `acts` takes the parameters of
     all of them, one site after the other."""
-    natural: tuple[float, ...] | None = None
-    """Parameters from which a fit may begin, for an effect that does not show in its derivatives at 0."""
+    natural: tuple[tuple[float, ...], ...] = ()
+    """Parameters from which a fit may begin, for an effect that shows little of itself in its derivatives at 0."""
     source: str
     """Where the prior's scale comes from."""
     confounded_with: tuple[str, ...] = ()
@@ -47,10 +47,9 @@ class Effect:
                 f"Effect {self.name}: units and prior_sd need one entry for each parameter; got {len(self.units)} and "
                 f"{len(self.prior_sd)}."
             )
-        if self.natural is not None and len(self.natural) != len(self.prior_sd):
+        if any(len(one) != len(self.prior_sd) for one in self.natural):
             raise ValueError(
-                f"Effect {self.name}: natural needs one entry for each parameter; got {len(self.natural)} for "
-                f"{len(self.prior_sd)}."
+                f"Effect {self.name}: each start in natural needs {len(self.prior_sd)} parameters; got {self.natural}."
             )
         if not all(sd > 0 for sd in self.prior_sd):
             raise ValueError(f"Effect {self.name}: prior_sd must be above 0; got {self.prior_sd}.")

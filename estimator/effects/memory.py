@@ -41,7 +41,10 @@ def _inertia(model: SheetModel, theta: Float[Array, " 2"], moment: Moment) -> Sh
 
 
 def _material_damping(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
-    """Kelvin and Voigt's: stress C (E + theta dE/dt), of stretching and of bending."""
+    """Kelvin and Voigt's: stress C (E + theta dE/dt), of stretching and of bending, after what changes either.
+
+    As if all had settled in the frame before; a hinge that is stretched within its plane is stiffer, without memory.
+    """
     left = moment.left_behind(theta[0])
     more = left / (1 - left)
     membrane, bending = model.term(TriangleMembrane), model.term(IsometricBending)
@@ -100,19 +103,9 @@ MEMORY = (
         acts=_inertia,
         units=("", "1/s"),
         prior_sd=(1.0, 5.0),
-        natural=(1.0, 2.0),
+        natural=((1.0, 2.0),),
         source="the sheet's own mass; a cloth in air swings for a second",
         confounded_with=("viscous_drag", "image_latency"),
-        non_negative=True,
-    ),
-    Effect(
-        name="material_damping",
-        acts=_material_damping,
-        units=("s",),
-        prior_sd=(0.2,),
-        natural=(0.2,),
-        source="skin relaxes within 0.1 to 0.3 s",
-        confounded_with=("viscous_drag", "tissue_creep", "image_latency"),
         non_negative=True,
     ),
     Effect(
@@ -131,6 +124,16 @@ MEMORY = (
         prior_sd=(0.3,),
         source="loose fascia gives within seconds",
         confounded_with=("attachments", "tissue_creep"),
+        non_negative=True,
+    ),
+    Effect(
+        name="material_damping",
+        acts=_material_damping,
+        units=("s",),
+        prior_sd=(0.2,),
+        natural=((0.2,),),
+        source="skin relaxes within 0.1 to 0.3 s",
+        confounded_with=("viscous_drag", "tissue_creep", "image_latency"),
         non_negative=True,
     ),
 )

@@ -24,8 +24,8 @@ Kind = TypeVar("Kind", bound=Term)
 
 SHORTEST = 1e-3
 """Time constant below which what follows does so at once where the tool stands [s]."""
-STOOD = 1e-6
-"""Way below which the tool stood [m]."""
+STOOD = 1e-4
+"""Way up to which the tool as well stood: its reports are no better [m]."""
 
 
 class View(eqx.Module):

@@ -38,7 +38,8 @@ class PointTracker:
     def start(self, still: list[MeasuredPoints]) -> Sheet:
         """Lay the mesh over the mean of one or more frames at rest; stray points and rarely seen ones are left out.
 
-        So are a few frames in which the points lie elsewhere than in the others: something has moved already.
+        So are a few frames in which the points lie elsewhere than in the others: something has moved already. A
+        declared mesh stays as it is declared.
 
         Raises:
             PerceptionError: points without identities, or too few of them.
@@ -57,7 +58,6 @@ class PointTracker:
                 )
             found = _alike(found, np.asarray(ids))
             times = Counter(i for frame in found for i in frame)
-            ids = [i for i in ids if times[i]]
             rest = np.array([np.mean([frame[i] for frame in found if i in frame], axis=0) for i in ids])
             self.ids = np.asarray(ids)
             flat = SheetPlane.through(rest).flatten(rest)
