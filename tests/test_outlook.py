@@ -115,6 +115,7 @@ def test_free_tissue_bears_nothing(outlook):
     assert found.energy == 0 and found.force == 0 and found.gain > 0
 
 
+@pytest.mark.slow
 def test_pulls_dealt_out_to_two_devices_have_the_outcomes_of_one():
     """In a process of its own, as JAX has one CPU device unless told otherwise before it starts.
 

@@ -105,7 +105,7 @@ def _reckoned(
     problem: Problem, named: np.ndarray, point: Point, frames: list[int]
 ) -> tuple[Fitted, tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]]:
     """A point with what is known there, and the step from it."""
-    along = directions(problem, problem.free(named), DIRECTIONS)
+    along = directions(problem, problem.free(named))
     weights = weighed(problem, point, frames)
     return _found(problem, named, point, linearised(problem, point, weights, along), weights)
 
@@ -147,9 +147,9 @@ def _shortened(
     return None
 
 
-def directions(problem: Problem, free: np.ndarray, width: int) -> Float[np.ndarray, "p d"]:
+def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
     """Unit vectors along parameters, padded to a width that most fits share, so that they are compiled once."""
-    along = np.zeros((problem.sheet.size, max(width, len(free))))
+    along = np.zeros((problem.sheet.size, max(DIRECTIONS, len(free))))
     along[free, np.arange(len(free))] = 1
     return along
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, fit, gains_over, linearised, moved
+from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, directions, fit, gains_over, linearised, moved
 from jiggle_mj.estimator.attribution.normal_equations import reduced, without_stiffnesses
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects.effect import Effect
@@ -45,8 +45,8 @@ class Score:
 
 def scores(problem: Problem, fitted: Fitted) -> list[Score]:
     """Every effect of the library that was not fitted already, the likeliest first."""
-    n, all_ways = len(fitted.site_precision), np.eye(problem.sheet.size)
-    glances = linearised(problem, fitted.point, fitted.weights, all_ways)
+    n, every = len(fitted.site_precision), directions(problem, np.arange(problem.sheet.size))
+    glances = linearised(problem, fitted.point, fitted.weights, every)
     square = reduced(problem, glances, problem.sheet.size)
     left, whole = without_stiffnesses(square, fitted.site_precision), square[n:, n:]
     found = [
