@@ -36,6 +36,7 @@ from jiggle_mj.scenes.report_disturbances import (
     PointSlip,
     ToolLatency,
     ToolScale,
+    ToolTurn,
 )
 from jiggle_mj.scenes.sheet_disturbances import (
     Anisotropy,
@@ -79,6 +80,7 @@ INSIDE: dict[str, tuple[str, *tuple[Disturbance, ...]]] = {
     "anchor shift": ("anchor_shift", AnchorShift(magnitude=0.003, direction=(1.0, 0.3, 0.0), start=LATE)),
     "anchor creep": ("anchor_creep", AnchorCreep(magnitude=0.5)),
     "tool scale": ("tool_scale", ToolScale(magnitude=1.08)),
+    "tool turn": ("tool_turn", ToolTurn(magnitude=4.0)),
     "tool latency": ("tool_latency", ToolLatency(magnitude=0.2), MOVING),
     "image latency": ("image_latency", ImageLatency(magnitude=0.2), MOVING),
     "camera bias": ("camera_bias", CameraBias(magnitude=0.003, pitch_deg=1.0, start=LATE)),

@@ -43,6 +43,7 @@ DISTURBANCES: dict[str, type[Disturbance]] = {
     "inertia": report.Inertia,
     "tool_bias": report.ToolBias,
     "tool_scale": report.ToolScale,
+    "tool_turn": report.ToolTurn,
     "tool_latency": report.ToolLatency,
     "camera_bias": report.CameraBias,
     "camera_drift": report.CameraDrift,

@@ -36,6 +36,8 @@ class Faults:
     """Reported minus true tip [m]."""
     tool_scale: float = 1.0
     """Reported over true way since the jaws closed."""
+    tool_turn: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    """From the true to the reported way."""
     tool_delay: float = 0.0
     """Age of the reported tip [s]."""
     image_delay: float = 0.0
@@ -135,7 +137,8 @@ class Observer:
         faults = self.faults
         late = self._history is not None and faults.tool_delay > 0
         true = self._history.tip_before(faults.tool_delay) if late and self._history else self.simulation.jaws.tip
-        return self._closed_at + faults.tool_scale * (true - self._closed_at) + faults.tool_offset
+        way = faults.tool_scale * faults.tool_turn @ (true - self._closed_at)
+        return self._closed_at + way + faults.tool_offset
 
     def reports(self) -> tuple[ToolReport, ...]:
         """What the tool has said since this was last asked, now left out."""

@@ -42,6 +42,20 @@ class ToolScale(SensingDisturbance):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ToolTurn(SensingDisturbance):
+    """The robot's axes are turned against the camera's, and with them the way that it reports since the jaws closed."""
+
+    magnitude: float = number(3.0, unit="degrees", at_least=-180, at_most=180)
+    about: tuple[float, float, float] = vector((0.0, 1.0, 0.0), length=3, direction=True)
+    """The axis of the turn, world; its length does not count."""
+
+    def begin(self, observer: "Observer") -> None:
+        """Turn the report."""
+        axis = np.array(self.about) / np.linalg.norm(self.about)
+        observer.faults.tool_turn = Rotation.from_rotvec(self.magnitude * axis, degrees=True).as_matrix()
+
+
+@dataclass(frozen=True, kw_only=True)
 class ToolLatency(SensingDisturbance):
     """The tool's pose is old when it is reported."""
 

@@ -167,6 +167,13 @@ def test_a_late_report_is_where_the_tool_was(plain, moment):
         np.testing.assert_allclose(later.tool, 2.5 * WAY, atol=1e-12)
 
 
+def test_a_turned_way_is_as_long(plain, moment):
+    with jax.enable_x64(True):
+        turned = EFFECTS["tool_turn"].acts(plain, jnp.array([0.0, np.pi / 2, 0.0]), moment)
+        x, y, z = 2 * WAY
+        np.testing.assert_allclose(turned.tool, [z, y, -x], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("changed", "says"),
     [

@@ -84,6 +84,13 @@ def test_the_reported_way_is_longer_than_the_true_one():
     np.testing.assert_allclose(lift_tip(reference) - CORNER, 1.1 * (reference.truth_frame().tip - CORNER), atol=1e-12)
 
 
+def test_the_reported_way_is_turned_against_the_true_one():
+    reference = made("tool_turn=90")
+    lift(reference)
+    x, y, z = reference.truth_frame().tip - CORNER
+    np.testing.assert_allclose(lift_tip(reference) - CORNER, [z, y, -x], atol=1e-12)
+
+
 def test_late_senses_show_where_things_were():
     """To the step; the tool moved less than that ago."""
     tips, surfaces = [], []

@@ -30,6 +30,11 @@ def _image_latency(model: SheetModel, theta: Float[Array, " 1"], moment: Moment)
     return _at_another_time(model, moment, -theta[0])
 
 
+def _tool_turn(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
+    """The true way is the reported one turned by theta [rad], late as either may be."""
+    return _taken(model, _rotation(theta) @ model.tool)
+
+
 def _camera_bias(model: SheetModel, theta: Float[Array, " 6"], moment: Moment) -> SheetModel:
     """Shift [m] and turn [rad] of all that is seen, about the middle of the sheet, since it was seen at rest."""
     return _moved(model, theta[:3], theta[3:])
@@ -126,12 +131,21 @@ SENSING = (
         sensing=True,
     ),
     Effect(
+        name="tool_turn",
+        acts=_tool_turn,
+        units=("rad", "rad", "rad"),
+        prior_sd=(0.03, 0.03, 0.03),
+        source="a hand-eye calibration is right within 1 to 2 degrees",
+        confounded_with=("camera_bias", "tool_bias"),
+        sensing=True,
+    ),
+    Effect(
         name="camera_bias",
         acts=_camera_bias,
         units=("m", "m", "m", "rad", "rad", "rad"),
         prior_sd=(3e-3, 3e-3, 3e-3, 0.03, 0.03, 0.03),
         source="a hand-eye calibration is right within 1 to 3 mm and 1 to 2 degrees",
-        confounded_with=("depth_scale", "anchor_shift", "tool_bias"),
+        confounded_with=("depth_scale", "anchor_shift", "tool_bias", "tool_turn"),
         sensing=True,
     ),
     Effect(
