@@ -86,9 +86,7 @@ def test_a_second_look_at_each_frame_is_nearer_to_the_truth(scene):
     assert error[True] < 0.95 * error[False]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "sl-d" else name for name in PAPERS]
-)
+@pytest.mark.parametrize("name", PAPERS)
 def test_the_papers_policies_move_the_grasp_that_they_are_given(scene, name):
     policy = policy_named(name, scene, seed=0)
     assert policy is not None
