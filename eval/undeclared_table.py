@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jiggle_mj.estimator.attribution.closing import LEFT_OVER
 from jiggle_mj.eval.closing_the_loop import DISCREPANCY, close_loop
 from jiggle_mj.eval.tables import carry_out
 from jiggle_mj.scenes import Reference, Scene, load_scene, programme
@@ -97,8 +98,6 @@ OUTSIDE: dict[str, Disturbance] = {
 }
 """What the library leaves out."""
 NOTHING = "nothing"
-HONEST = ("unexplained", "effect-with-remainder")
-"""Verdicts that say that something is left over."""
 Found = dict[tuple[str, int], dict[str, Any]]
 """discrepancy.json by what is undeclared and seed."""
 
@@ -204,7 +203,7 @@ def _sums(runs: Found) -> list[str]:
     if nothing:
         said.append(f"Nothing undeclared: {sum(bool(one['effects']) for one in nothing)} of {len(nothing)} named.")
     if outside:
-        honest = sum(one["verdict"] in HONEST for one in outside)
+        honest = sum(one["verdict"] in LEFT_OVER for one in outside)
         said.append(f"Not in the library: {honest} of {len(outside)} unexplained or with a remainder.")
     return said
 

@@ -67,7 +67,7 @@ class History:
         longest = max(len(one) for one in told.values())
         self._reports = {grasp: _padded(one, longest) for grasp, one in told.items()}
 
-    def moment(self, k: int, states: Float[np.ndarray, "frames n 3"]) -> Moment:
+    def moment(self, k: int, states: Float[np.ndarray, "frames n 3"] | Float[Array, "frames n 3"]) -> Moment:
         """What an effect may know of frame k."""
         one, follows = self.frames[k], self._follows
         twice = follows[k] and follows[k - 1]

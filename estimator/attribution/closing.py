@@ -43,6 +43,8 @@ REMAINDER = 60.0
 """What larger errors without a cause may gain before something is said to be left over [nat]."""
 EXCESS = 5.0
 """The same, by how many times the stated variance parts left out may be missed."""
+LEFT_OVER = ("unexplained", "effect-with-remainder")
+"""Verdicts that say so."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +118,7 @@ def close_the_loop(
         reported = before, foretell(problem, stages[-1].fitted, spare) if accepted else before
     verdict, last = _verdict(accepted, rivals, stages[-1], reported), stages[-1]
     final = last.fitted
-    if verdict in ("unexplained", "effect-with-remainder"):
+    if verdict in LEFT_OVER:
         say("fitting again with larger errors, for what is left over")
         wider = problem.widened(last.left.variance, last.left.amplitude * problem.amplitude)
         final = fit(wider, final.named, final.point, used)

@@ -5,17 +5,19 @@ if it lessens the misfit under the weights that it was reckoned with, so that no
 more. Stiffnesses go where samples of the belief say.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
 from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, glance, misfit, weigh
 from jiggle_mj.estimator.attribution.normal_equations import less_offset, reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
+from jiggle_mj.estimator.effects.sheet_model import Moment
 from jiggle_mj.estimator.filters.implicit import reconsidered
 
 ODDS = 2.2
@@ -157,23 +159,29 @@ def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
 def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metric]:
     """Every frame at a point: how misfits weigh."""
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
-    weights = {}
-    for k in frames:
-        moment = problem.history.moment(k, point.states)
-        frame, x = problem.history.frames[k].frame, jnp.asarray(point.states[k])
-        weights[k] = weigh(problem.sheet, theta, s, frame, moment, x, noise)
-    return weights
+    return {
+        k: weigh(problem.sheet, theta, s, frame, moment, x, noise)
+        for k, (frame, moment, x) in _moments(problem, point, frames).items()
+    }
 
 
 def linearised(
     problem: Problem, point: Point, weights: dict[int, Metric], along: Float[np.ndarray, "p d"]
 ) -> dict[int, Glance]:
     """Every frame where it was weighed: its normal equations."""
-    glances, theta, along_ = {}, jnp.asarray(point.theta), jnp.asarray(along)
-    for k, metric in weights.items():
-        moment = problem.history.moment(k, point.states)
-        glances[k] = glance(problem.sheet, metric, theta, along_, problem.history.frames[k].frame, moment)
-    return glances
+    theta, along_ = jnp.asarray(point.theta), jnp.asarray(along)
+    return {
+        k: glance(problem.sheet, weights[k], theta, along_, frame, moment)
+        for k, (frame, moment, _) in _moments(problem, point, weights).items()
+    }
+
+
+def _moments(
+    problem: Problem, point: Point, frames: Iterable[int]
+) -> dict[int, tuple[ClosedFrame, Moment, Float[Array, "n 3"]]]:
+    """Frames, what an effect may know of each, and their states, at a point."""
+    states, history = jnp.asarray(point.states), problem.history
+    return {k: (history.frames[k].frame, history.moment(k, states), states[k]) for k in frames}
 
 
 def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
@@ -193,10 +201,10 @@ def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> fl
     """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
     total, theta = 0.0, jnp.asarray(point.theta)
     for frames in problem.by_part(weights).values():
-        missed = []
-        for k in frames:
-            moment, frame = problem.history.moment(k, point.states), problem.history.frames[k].frame
-            missed.append(misfit(problem.sheet, weights[k], theta, frame, moment, jnp.asarray(point.states[k])))
+        missed = [
+            misfit(problem.sheet, weights[k], theta, frame, moment, x)
+            for k, (frame, moment, x) in _moments(problem, point, frames).items()
+        ]
         tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
         fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
         middle = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)

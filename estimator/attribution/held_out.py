@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
 from jiggle_mj.estimator.attribution.fit import Fitted, weighed
 from jiggle_mj.estimator.attribution.linear import Metric
-from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
 from scipy.stats import norm
 
@@ -55,22 +55,28 @@ class Foretold:
 
 def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
     """One part that was not fitted to."""
-    frames, point = problem.frames({part}), fitted.point
-    rest = np.asarray(problem.history.rest)
-    states = np.where(np.isin(np.arange(len(point.states)), frames)[:, None, None], rest[None], point.states)
-    seen = states
-    for _ in range(ROUNDS):
-        states, seen = predict_all(
-            problem.sheet, point.theta, point.s, problem.history, states, only=frames, by_tool=True
-        )
-    weights = weighed(problem, replace(point, states=states), frames)
+    frames = problem.frames({part})
+    anew = from_rest(problem, fitted.point, frames, by_tool=True)
+    weights = weighed(problem, anew, frames)
     known, off, sd = _covariance(problem, fitted), [], []
     for k in frames:
         frame = problem.history.frames[k].frame
         counted = np.asarray(frame.visible & ~frame.held)
-        off.append((np.asarray(frame.y) - seen[k])[counted])
-        sd.append(_sd(problem, weights[k], frame, known, jnp.asarray(states[k]))[counted])
+        off.append((np.asarray(frame.y) - anew.seen[k])[counted])
+        sd.append(_sd(problem, weights[k], frame, known, jnp.asarray(anew.states[k]))[counted])
     return Foretold(off=np.concatenate(off), sd=np.concatenate(sd))
+
+
+def from_rest(problem: Problem, point: Point, frames: list[int], *, by_tool: bool) -> Point:
+    """Some frames predicted anew, searched from rest; what is held goes as the tool says, or as it was seen."""
+    again = np.isin(np.arange(len(point.states)), frames)[:, None, None]
+    states = np.where(again, np.asarray(problem.history.rest)[None], point.states)
+    seen = states
+    for _ in range(ROUNDS):
+        states, seen = predict_all(
+            problem.sheet, point.theta, point.s, problem.history, states, only=frames, by_tool=by_tool
+        )
+    return replace(point, states=states, seen=seen)
 
 
 def _covariance(problem: Problem, fitted: Fitted) -> Float[np.ndarray, "n n"]:

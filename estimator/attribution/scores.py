@@ -5,8 +5,8 @@ force fields are marginalised, g its score and theta ~ N(0, Theta) before,
 
     ln BF = g^T (V + Theta^-1)^-1 g / 2 - ln |I + Theta V| / 2
 
-for each place where it may be, and the mean of the BFs over the places. An effect that shows little of
-itself in its derivatives at 0 is also tried from its natural size, with a few steps of a fit.
+for each place where it may be, and the mean of the BFs over the places. An effect that shows little of itself in its
+derivatives at 0 is also tried from its natural size, with a few steps of a fit.
 """
 
 from dataclasses import dataclass, replace
@@ -69,6 +69,12 @@ def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " 
     return 0.5 * float(np.linalg.slogdet(unit)[1]), sd[:d] * np.sqrt(np.diag(np.linalg.inv(unit)))
 
 
+def bayes_factor(problem: Problem, better: Fitted, plain: Fitted, sites: int) -> tuple[float, float]:
+    """By how much a fit is likelier than another, and ln BF: less what its effect at one of `sites` costs [nat]."""
+    likelier = min(gains_over(problem, better, plain))
+    return likelier, float(likelier - (occam(problem, better)[0] - occam(problem, plain)[0]) - np.log(sites))
+
+
 def _one(
     problem: Problem, fitted: Fitted, effect: Effect, site: int, left: Float[np.ndarray, "j j"], whole: np.ndarray
 ) -> Score:
@@ -111,13 +117,12 @@ def _where_natural(problem: Problem, fitted: Fitted, score: Score) -> Score:
     begun = [moved(problem, fitted, at, np.array(one)) for one in effect.natural]
     best = min(begun, key=lambda point: cost_under(problem, fitted.weights, point))
     found = fit(problem, np.append(fitted.named, at), best, parts, passes=STEPS)
-    likelier = min(gains_over(problem, found, fitted))
-    gain = likelier - occam(problem, found)[0] + occam(problem, fitted)[0] - np.log(effect.sites)
+    likelier, gain = bayes_factor(problem, found, fitted, effect.sites)
     if gain <= score.log_bayes_factor:
         return score
     return replace(
         score,
-        log_bayes_factor=float(gain),
+        log_bayes_factor=gain,
         theta=found.point.theta[at],
         p_value=float(chi2.sf(2 * max(likelier, 0.0), len(at))),
         began=found.point,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from jiggle_mj.estimator.perception.point_tracker import usual
 
 PAIRS = 20_000
 """Pairs of points whose covariance is looked at."""
@@ -72,9 +73,7 @@ def measure(
     off = off[np.isfinite(off[:, seen]).all(axis=(1, 2))][:, seen]
     if not len(off) or seen.sum() < 3:
         return None
-    squares = np.mean(off**2, axis=(1, 2))
-    jumps = squares > JUMP * np.median(squares)
-    off = off[~jumps] if jumps.mean() <= RARELY else off
+    off = off[usual(np.mean(off**2, axis=(1, 2)), times=JUMP, rarely=RARELY)]
     total = float(np.mean(off**2))
     i, j = np.random.default_rng(seed).integers(0, int(seen.sum()), (2, PAIRS))
     i, j = i[i != j], j[i != j]

@@ -13,21 +13,19 @@ from itertools import pairwise, permutations
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Float
 from jiggle_mj.estimator.attribution.closed_frames import USUAL_GAP, ClosedFrame, History, Timed
 from jiggle_mj.estimator.attribution.closing import Closed
 from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, weighed
 from jiggle_mj.estimator.attribution.gather import Gathered
+from jiggle_mj.estimator.attribution.held_out import from_rest
 from jiggle_mj.estimator.attribution.problem import Point, Problem
-from jiggle_mj.estimator.attribution.sheet import look, predict_all
+from jiggle_mj.estimator.attribution.sheet import look
 from jiggle_mj.estimator.mesh import far_apart
+from jiggle_mj.estimator.policies.information import PLACES, SLANTED, UP
 
-PLACES = 12
-"""Of grasps, spread over the sheet."""
 BEST = 3
-"""Places, best when lifted from, from which other directions are tried."""
-SLANTED = 0.5**0.5 * np.array([[1, 0, 1], [0, 1, 1], [-1, 0, 1], [0, -1, 1]], dtype=float)
-"""Directions beside straight up."""
+"""Places, best when lifted from, from which slanted pulls are tried."""
 HOLD = 5.0
 """How long what was pulled is held still [s]."""
 ENOUGH = 10.0
@@ -63,14 +61,14 @@ def suggest(closed: Closed, gathered: Gathered, *, say: Callable[[str], None] = 
     trials = open_[-1]
     fits, names = [one.fitted for one in trials], tuple(one.effect.name for one in trials)
     say(f"looking for a pull that tells {', '.join(names)} apart")
-    rest, far = gathered.estimator.sheet.rest, _farthest(gathered)
+    rest, far, gap, radius = gathered.estimator.sheet.rest, *_usual(gathered)
     places = far_apart(rest, PLACES).tolist()
 
     def tried(place: int, direction: Float[np.ndarray, " 3"]) -> tuple[float, int, Float[np.ndarray, " 3"]]:
-        frames = _frames(gathered, place, far * direction)
+        frames = _frames(gathered, place, far * direction, gap=gap, radius=radius)
         return told_apart(closed.problem, fits, frames), place, far * direction
 
-    best = sorted((tried(place, np.array([0.0, 0.0, 1.0])) for place in places), key=lambda one: -one[0])
+    best = sorted((tried(place, UP[0]) for place in places), key=lambda one: -one[0])
     best += [tried(place, direction) for _, place, _ in best[:BEST] for direction in SLANTED]
     expected, place, pull = max(best, key=lambda one: one[0])
     return Suggestion(grasp=rest[place], pull=pull, hold=HOLD, expected=expected, between=names)
@@ -84,10 +82,7 @@ def told_apart(problem: Problem, fits: list[Fitted], frames: list[Timed]) -> flo
 
 def _shown(problem: Problem, fitted: Fitted, frames: list[Timed]) -> list[Timed]:
     """The frames as they would be seen if a fit were right."""
-    rest = jnp.asarray(problem.history.rest)
-    moment = History(frames, np.asarray(rest)).moment(0, np.tile(rest, (len(frames), 1, 1)))
-    model = problem.sheet.model(jnp.asarray(fitted.point.theta), moment, jnp.zeros(3))
-    lying = look(model, rest)
+    lying = _lying(_of(problem, frames), fitted)
     frames = [replace(one, frame=eqx.tree_at(lambda f: (f.y, f.turned), one.frame, (lying, lying))) for one in frames]
     told = [replace(one, frame=eqx.tree_at(lambda f: f.by_points, one.frame, jnp.asarray(False))) for one in frames]
     seen = _predicted(_of(problem, told), fitted, by_tool=True).seen
@@ -97,12 +92,20 @@ def _shown(problem: Problem, fitted: Fitted, frames: list[Timed]) -> list[Timed]
     ]
 
 
+def _lying(problem: Problem, fitted: Fitted) -> Float[Array, "n 3"]:
+    """Where a fit has the sheet seen as the jaws close."""
+    moment = problem.history.moment(0, _at_rest(problem))
+    model = problem.sheet.model(jnp.asarray(fitted.point.theta), moment, jnp.zeros(3))
+    return look(model, problem.history.rest)
+
+
 def _predicted(problem: Problem, fitted: Fitted, *, by_tool: bool) -> Point:
-    theta, s = fitted.point.theta, fitted.point.s
-    states = np.tile(np.asarray(problem.history.rest), (len(problem.history.frames), 1, 1))
-    states, _ = predict_all(problem.sheet, theta, s, problem.history, states, by_tool=by_tool)
-    states, seen = predict_all(problem.sheet, theta, s, problem.history, states, by_tool=by_tool)
-    return Point(theta=theta, s=s, states=states, seen=seen)
+    every, rest = list(range(len(problem.history.frames))), _at_rest(problem)
+    return from_rest(problem, replace(fitted.point, states=rest, seen=rest), every, by_tool=by_tool)
+
+
+def _at_rest(problem: Problem) -> Float[np.ndarray, "frames n 3"]:
+    return np.tile(np.asarray(problem.history.rest), (len(problem.history.frames), 1, 1))
 
 
 def _against(problem: Problem, fitted: Fitted, frames: list[Timed]) -> float:
@@ -116,12 +119,11 @@ def _of(problem: Problem, frames: list[Timed]) -> Problem:
     return replace(problem, history=History(frames, np.asarray(problem.history.rest)))
 
 
-def _frames(gathered: Gathered, place: int, pull: Float[np.ndarray, " 3"]) -> list[Timed]:
+def _frames(gathered: Gathered, place: int, pull: Float[np.ndarray, " 3"], *, gap: float, radius: float) -> list[Timed]:
     """The jaws closed on a place, half of the pull, all of it, and after the hold; what is seen is left open."""
     rest = gathered.estimator.sheet.rest
-    last, gap = gathered.frames[-1], _usual_gap(gathered.frames)
-    held = np.linalg.norm(rest - rest[place], axis=1) <= _reach(gathered)
-    like = last.frame
+    last, like = gathered.frames[-1], gathered.frames[-1].frame
+    held = np.linalg.norm(rest - rest[place], axis=1) <= radius
     precision = jnp.broadcast_to(jnp.max(like.precision, axis=0)[None], like.precision.shape)
     grasp, began = last.grasp + 1, last.time + HOLD
     moves = [(0.0, 0.0), (gap, 0.5), (2 * gap, 1.0), (2 * gap + HOLD, 1.0)]
@@ -150,21 +152,13 @@ def _frames(gathered: Gathered, place: int, pull: Float[np.ndarray, " 3"]) -> li
     ]
 
 
-def _farthest(gathered: Gathered) -> float:
-    """How far the tool has gone from where it closed [m]."""
-    return max(float(np.linalg.norm(one.frame.way)) for one in gathered.frames)
-
-
-def _usual_gap(frames: list[Timed]) -> float:
-    """Between frames of a grasp, in the median [s]."""
-    return float(np.median([b.time - a.time for a, b in pairwise(frames) if a.grasp == b.grasp] or [USUAL_GAP]))
-
-
-def _reach(gathered: Gathered) -> float:
-    """Farthest that a held particle is from the middle of those held [m]."""
-    rest = gathered.estimator.sheet.rest
-
-    def radius(held: Bool[np.ndarray, " n"]) -> float:
-        return float(np.linalg.norm(rest[held] - rest[held].mean(axis=0), axis=1).max())
-
-    return max(radius(np.asarray(one.frame.held)) for one in gathered.frames)
+def _usual(gathered: Gathered) -> tuple[float, float, float]:
+    """How far the tool goes at most [m], what lies between frames of a grasp [s], and how wide the jaws hold [m]."""
+    rest, frames = gathered.estimator.sheet.rest, gathered.frames
+    gaps = [b.time - a.time for a, b in pairwise(frames) if a.grasp == b.grasp]
+    grips = [rest[np.asarray(one.frame.held)] for one in frames]
+    return (
+        max(float(np.linalg.norm(one.frame.way)) for one in frames),
+        float(np.median(gaps or [USUAL_GAP])),
+        max(float(np.linalg.norm(grip - grip.mean(axis=0), axis=1).max()) for grip in grips),
+    )

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, fit, gains_over, moved, without
+from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, fit, moved, without
 from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
 from jiggle_mj.estimator.attribution.problem import Point, Problem
-from jiggle_mj.estimator.attribution.scores import Score, occam, scores
+from jiggle_mj.estimator.attribution.scores import Score, bayes_factor, occam, scores
 from jiggle_mj.estimator.effects import Effect
 
 LOOKED_AT = 3
@@ -103,20 +103,18 @@ def judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str], 
 def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial], used: set[int]) -> Trial:
     effect = problem.sheet.effect(score.name)
     at = problem.sheet.place(effect.name, score.site)
-    named = np.concatenate([*(problem.sheet.place(one.effect.name, one.score.site) for one in accepted), at])
+    named = np.concatenate([*(one.at for one in accepted), at])
     before = stage.fitted
     point = _stepped(problem, before, effect, at, score) if score.began is None else score.began
     fitted = fit(problem, named.astype(int), point, used)
-    volume, sd = occam(problem, fitted)
-    gain = min(gains_over(problem, fitted, before)) - (volume - occam(problem, before)[0]) - np.log(effect.sites)
     return Trial(
         score=score,
         effect=effect,
         fitted=fitted,
-        log_bayes_factor=float(gain),
+        log_bayes_factor=bayes_factor(problem, fitted, before, effect.sites)[1],
         at=at,
         theta=fitted.point.theta[at],
-        sd=sd[-len(at) :],
+        sd=occam(problem, fitted)[1][-len(at) :],
     )
 
 
@@ -136,10 +134,8 @@ def left_out(problem: Problem, fitted: Fitted, used: set[int]) -> dict[int, Fitt
 def jackknife_sd(thetas: list[np.ndarray], size: int) -> np.ndarray:
     """The jackknife's standard error of parameters, of fits without one part each; zero if there is none.
 
-    Such a fit is one step from the whole one, so that it says the least.
-
     Grasps disagree by more than their noise where the model is wrong in other ways too [Miller 1974,
-    doi:10.1093/biomet/61.1.1].
+    doi:10.1093/biomet/61.1.1]. Such a fit is one step from the whole one, so that this is the least.
     """
     if not thetas:
         return np.zeros(size)

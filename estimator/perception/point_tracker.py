@@ -7,7 +7,7 @@ The estimator triangulates the points anew, unless a mesh is declared. Clouds wi
 from collections import Counter
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
 
 from jiggle_mj.errors import PerceptionError
@@ -103,8 +103,13 @@ def _alike(found: list[dict[int, np.ndarray]], ids: Int[np.ndarray, " n"]) -> li
     positions = np.array([_positions(frame, ids) for frame in found])
     squared = (positions - np.nanmedian(positions, axis=0)) ** 2
     off = np.nansum(squared, axis=(1, 2)) / np.maximum(np.isfinite(squared).sum(axis=(1, 2)), 1)
-    astray = off > ASTRAY * np.median(off)
-    return [frame for frame, one in zip(found, astray, strict=True) if not one] if astray.mean() <= FEW else found
+    return [frame for frame, kept in zip(found, usual(off, times=ASTRAY, rarely=FEW), strict=True) if kept]
+
+
+def usual(squares: Float[np.ndarray, " t"], *, times: float, rarely: float) -> Bool[np.ndarray, " t"]:
+    """All but those beyond that many times the median, if they are at most a share `rarely`; more are no exceptions."""
+    beyond = squares > times * np.median(squares)
+    return ~beyond if beyond.mean() <= rarely else np.ones(len(squares), dtype=bool)
 
 
 def _positions(found: dict[int, np.ndarray], ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

@@ -63,15 +63,10 @@ TRIFLE = 0.1
 """Share of the limit on the energy below which a prediction is not held against what is seen."""
 LOST = 5e-3
 """Slip from which the tissue is no longer in the jaws [m]."""
-_SLANT = 0.5**0.5
-DIRECTIONS = np.array(
-    [
-        [0, 0, 1],
-        *([x, y, 0] for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))),
-        *([_SLANT * x, _SLANT * y, _SLANT] for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))),
-    ],
-    dtype=float,
-)
+UP = np.array([[0.0, 0.0, 1.0]])
+ALONG = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
+SLANTED = 0.5**0.5 * (ALONG + UP)
+DIRECTIONS = np.concatenate([UP, ALONG, SLANTED])
 """Up, along the sheet, and between."""
 PULLS = np.kron(DIRECTIONS, STEP * np.array(AHEAD)[:, None])
 """Where the tip may be pulled from where it is [m]: every direction as far as `AHEAD` says, one after the other."""
