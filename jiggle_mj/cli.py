@@ -32,6 +32,7 @@ Sensing = Literal["stereo", "points", "particles", "cloud"]
 FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
 PathArgument = Annotated[Path, tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
+RowsName = Literal["inside", "together", "images", "outside", "nothing"]
 TableName = Literal["main", "active", "acts", "undeclared", "scalability", "simulation", "one-lift"]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 AsJson = Annotated[bool, tyro.conf.arg(name="json")]
@@ -383,6 +384,7 @@ def table(
     seeds: tuple[int, ...] | None = None,
     sensing: Sensing | None = None,
     jobs: int | None = None,
+    rows: tuple[RowsName, ...] | None = None,
 ) -> None:
     """Run a table of scenes and seeds, and print it as Markdown; what is in OUT already is not run again.
 
@@ -396,6 +398,8 @@ def table(
             out.
         sensing: of active; particles if left out.
         jobs: of active, acts and undeclared: how many runs at a time; as many as there are usable cores if left out.
+        rows: of undeclared: one effect of the library, two together, one from images, what is outside the library, or
+            nothing; all if left out.
     """
     from jiggle_mj.eval import paper_tables, tables
 
@@ -406,6 +410,8 @@ def table(
         raise OptionError(f"--sensing is for the table active; got {name}.")
     if jobs is not None and name not in ("active", "acts", "undeclared"):
         raise OptionError(f"--jobs is for the tables active, acts and undeclared; got {name}.")
+    if rows is not None and name != "undeclared":
+        raise OptionError(f"--rows is for the table undeclared; got {name}.")
     if name == "main":
         print(tables.markdown(tables.measure(tables.MAIN, seeds or range(3), out, say=say)))
     elif name == "active":
@@ -434,9 +440,10 @@ def table(
         print(acts_table.markdown(found))
     elif name == "undeclared":
         from jiggle_mj.eval import undeclared_table as undeclared
+        from jiggle_mj.eval.undeclared_panel import GROUPS
         from jiggle_mj.worker_processes import WorkerProcesses
 
-        names = (*undeclared.INSIDE, *undeclared.OUTSIDE, undeclared.NOTHING)
+        names = [name for group in (rows or GROUPS) for name in GROUPS[group]]
         with WorkerProcesses(jobs) as executor:
             closed = undeclared.measure(names, seeds or range(5), out, executor=executor, say=say)
         print(undeclared.markdown(closed))

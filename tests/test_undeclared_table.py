@@ -1,14 +1,18 @@
 """The table of undeclared effects: its scenes, and counts by hand."""
 
 import json
+import math
 from concurrent.futures import ThreadPoolExecutor
+from typing import get_args
 
 import pytest
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.eval import undeclared_table
 from jiggle_mj.eval.closing_the_loop import DISCREPANCY
-from jiggle_mj.eval.undeclared_table import INSIDE, MOVING, NOTHING, OUTSIDE, markdown, measure, scene_with
+from jiggle_mj.eval.undeclared_panel import GROUPS, MOVING, OUTSIDE, ROWS, TOGETHER, scene_with
+from jiggle_mj.eval.undeclared_table import markdown, measure
 
+from jiggle_mj.cli import RowsName
 from jiggle_mj.recording_declaration import VERSION, file_metadata
 
 
@@ -26,21 +30,34 @@ def found(verdict: str, *names: str, after: float = 1e-3, also: tuple[str, ...] 
 
 
 def test_scenes_differ_by_what_is_undeclared_alone_and_keep_it_secret():
-    plain = scene_with(NOTHING, 0)
+    plain = scene_with("nothing", 0)
     assert plain.disturbances == ()
-    for name in (*INSIDE, *OUTSIDE):
+    for name, row in ROWS.items():
         scene = scene_with(name, 0)
-        assert len(scene.disturbances) == (2 if MOVING in scene.disturbances else 1)
+        assert len(scene.disturbances) == max(len(row.effects), name in OUTSIDE) + (MOVING in scene.disturbances)
         assert scene.secret and scene.attachments == plain.attachments
+
+
+def test_rows_are_told_apart_by_name():
+    assert len(ROWS) == sum(len(rows) for rows in GROUPS.values())
+    assert set(get_args(RowsName)) == set(GROUPS)
 
 
 def test_what_is_inside_is_in_the_library_and_what_is_outside_is_not():
     names = {effect.name for effect in LIBRARY}
-    assert {effect for effect, *_ in INSIDE.values()} <= names
-    assert (
-        not {undeclared_table.scene_with(name, 0).disturbances[0].__class__.__name__.lower() for name in OUTSIDE}
-        & names
-    )
+    assert {effect for row in ROWS.values() for effect in row.effects} <= names
+    assert not {type(one).__name__.lower() for row in OUTSIDE.values() for one in row.disturbances} & names
+
+
+def test_two_effects_are_each_of_another_name_and_begin_in_turn():
+    for row in TOGETHER.values():
+        assert len(set(row.effects)) == 2
+        assert [one.start for one in row.disturbances] == sorted(one.start for one in row.disturbances)
+
+
+def test_noise_is_as_strong_in_every_row():
+    sd = [math.hypot(scene_with(name, 0).sensing.point_sd, scene_with(name, 0).sensing.smooth_sd) for name in ROWS]
+    assert sd == pytest.approx([sd[0]] * len(sd))
 
 
 def test_counts():
@@ -48,19 +65,30 @@ def test_counts():
         ("friction", 0): found("effect", "friction"),
         ("friction", 1): found("ambiguous", "gravity", also=("friction",)),
         ("stretch", 0): found("no-effect", after=2e-3),
+        ("stretch and image latency", 0): found("effect", "image_latency", "stretch"),
+        ("stretch and image latency", 1): found("ambiguous", "image_latency", also=("stretch",)),
+        ("bending and tissue creep", 0): found("effect", "bending", after=2.1e-3),
+        ("stretch, images", 0): found("effect", "stretch", after=0.5e-3),
         ("grasp slips", 0): found("unexplained", after=2e-3),
         ("anchors break", 0): found("effect", "anchor_creep"),
-        (NOTHING, 0): found("no-effect", after=2e-3),
+        ("nothing", 0): found("no-effect", after=2e-3),
+        ("nothing, images", 0): found("effect", "gravity"),
     }
     lines = markdown(runs).splitlines()
     assert lines[2] == (
         "| friction | friction (1); gravity, friction (1) | effect (1); ambiguous (1) | 0.1 (0.01), 0.2 (0.02); "
         "0.1 (0.01), 0.2 (0.02) | 2.00 → 1.00; 2.00 → 1.00 | 0.50 → 0.50; 0.50 → 0.50 |"
     )
-    said = " ".join(lines[-3:])
-    assert "named first in 1 of 3, among those named in 2; the held-out error falls by 50% at the median" in said
-    assert "Nothing undeclared: 0 of 1 named." in said
-    assert "Not in the library: 1 of 2 unexplained or with a remainder." in said
+    assert lines[-5:] == [
+        "One effect: named first in 1 of 3, all added in 1, all among those named in 2; held-out error falls by 50% at "
+        "the median, and rises in 0.",
+        "Two effects: named first in 3 of 3, all added in 1, all among those named in 2; held-out error falls by 50% "
+        "at the median, and rises in 1.",
+        "One effect, from images: named first in 1 of 1, all added in 1, all among those named in 1; held-out error "
+        "falls by 75% at the median, and rises in 0.",
+        "Nothing undeclared: 1 of 2 named.",
+        "Not in the library: 1 of 2 unexplained or with a remainder.",
+    ]
 
 
 @pytest.mark.parametrize(("version", "times"), [(file_metadata()[VERSION], 1), ("0.0", 2)])

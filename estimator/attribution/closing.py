@@ -6,7 +6,7 @@ that foretells it best, or the likeliest of those that do it about as well. Agai
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -105,7 +105,7 @@ def close_the_loop(
         best = _best(passed)
         close = [one for one in passed if one is not best and _not_told_from(one, best)]
         refused += [(one, _behind(one, best)) for one in passed if one is not best and one not in close]
-        accepted.append(best)
+        accepted = [replace(one, fitted=best.fitted, sds=best.sds) for one in accepted] + [best]
         rivals.append(close)
         assert best.left is not None and best.folds is not None
         stages.append(Stage(fitted=best.fitted, left=best.left, folds=best.folds, scores=[]))

@@ -6,20 +6,26 @@ more. Stiffnesses go where samples of the belief say.
 """
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, glance, misfit, weigh
+from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, Misfit, glance, misfit, weigh
 from jiggle_mj.estimator.attribution.normal_equations import less_offset, reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
 from jiggle_mj.estimator.effects.sheet_model import Moment
 from jiggle_mj.estimator.filters.implicit import reconsidered
 
+from jiggle_mj.worker_processes import usable_cores
+
+T = TypeVar("T")
 ODDS = 2.2
 """What an attachment costs: the logarithm of nine to one [nat]."""
 STIFFEST = 0.98
@@ -159,10 +165,13 @@ def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
 def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metric]:
     """Every frame at a point: how misfits weigh."""
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
-    return {
-        k: weigh(problem.sheet, theta, s, frame, moment, x, noise)
-        for k, (frame, moment, x) in _moments(problem, point, frames).items()
-    }
+    moments = _moments(problem, point, frames)
+
+    def one(k: int) -> Metric:
+        frame, moment, x = moments[k]
+        return weigh(problem.sheet, theta, s, frame, moment, x, noise)
+
+    return side_by_side(one, moments)
 
 
 def linearised(
@@ -170,10 +179,25 @@ def linearised(
 ) -> dict[int, Glance]:
     """Every frame where it was weighed: its normal equations."""
     theta, along_ = jnp.asarray(point.theta), jnp.asarray(along)
-    return {
-        k: glance(problem.sheet, weights[k], theta, along_, frame, moment)
-        for k, (frame, moment, _) in _moments(problem, point, weights).items()
-    }
+    moments = _moments(problem, point, weights)
+
+    def one(k: int) -> Glance:
+        frame, moment, _ = moments[k]
+        return glance(problem.sheet, weights[k], theta, along_, frame, moment)
+
+    return side_by_side(one, moments)
+
+
+def side_by_side(of: Callable[[int], T], frames: Iterable[int]) -> dict[int, T]:
+    """A function of each frame, on all usable cores: compiled code and BLAS leave the interpreter to other threads."""
+    frames, wide = list(frames), jax.config.jax_enable_x64
+
+    def one(k: int) -> T:
+        with jax.enable_x64(wide):  # which is said by thread
+            return of(k)
+
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        return dict(zip(frames, pool.map(one, frames), strict=True))
 
 
 def _moments(
@@ -200,11 +224,15 @@ def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, 
 def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> float:
     """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
     total, theta = 0.0, jnp.asarray(point.theta)
+    moments = _moments(problem, point, weights)
+
+    def of(k: int) -> Misfit:
+        frame, moment, x = moments[k]
+        return misfit(problem.sheet, weights[k], theta, frame, moment, x)
+
+    every = side_by_side(of, weights)
     for frames in problem.by_part(weights).values():
-        missed = [
-            misfit(problem.sheet, weights[k], theta, frame, moment, x)
-            for k, (frame, moment, x) in _moments(problem, point, frames).items()
-        ]
+        missed = [every[k] for k in frames]
         tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
         fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
         middle = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)

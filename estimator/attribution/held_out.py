@@ -1,12 +1,14 @@
 """How well frames are foretold that a fit never saw, from what the tool says alone."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.fit import Fitted, weighed
+from jiggle_mj.estimator.attribution.fit import Fitted, side_by_side, weighed
 from jiggle_mj.estimator.attribution.linear import Metric
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
@@ -24,8 +26,13 @@ class Foretold:
 
     off: Float[np.ndarray, "m 3"]
     """Seen less foretold [m]."""
-    sd: Float[np.ndarray, "m 3"]
-    """Of that, as the fit has it [m]."""
+    reckon: Callable[[], Float[np.ndarray, "m 3"]]
+    """What makes `sd`, which costs more than all the rest."""
+
+    @cached_property
+    def sd(self) -> Float[np.ndarray, "m 3"]:
+        """Of what is off, as the fit has it [m]."""
+        return self.reckon()
 
     @property
     def rms(self) -> float:
@@ -50,21 +57,27 @@ class Foretold:
     @staticmethod
     def together(parts: list["Foretold"]) -> "Foretold":
         """Several grasps."""
-        return Foretold(off=np.concatenate([one.off for one in parts]), sd=np.concatenate([one.sd for one in parts]))
+        return Foretold(
+            off=np.concatenate([one.off for one in parts]), reckon=lambda: np.concatenate([one.sd for one in parts])
+        )
 
 
 def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
     """One part that was not fitted to."""
     frames = problem.frames({part})
-    anew = from_rest(problem, fitted.point, frames, by_tool=True)
-    weights = weighed(problem, anew, frames)
-    known, off, sd = _covariance(problem, fitted), [], []
-    for k in frames:
-        frame = problem.history.frames[k].frame
-        counted = np.asarray(frame.visible & ~frame.held)
-        off.append((np.asarray(frame.y) - anew.seen[k])[counted])
-        sd.append(_sd(problem, weights[k], frame, known, jnp.asarray(anew.states[k]))[counted])
-    return Foretold(off=np.concatenate(off), sd=np.concatenate(sd))
+    anew, closed = from_rest(problem, fitted.point, frames, by_tool=True), problem.history.frames
+    counted = {k: np.asarray(closed[k].frame.visible & ~closed[k].frame.held) for k in frames}
+
+    def sd() -> Float[np.ndarray, "m 3"]:
+        weights, known = weighed(problem, anew, frames), _covariance(problem, fitted)
+
+        def one(k: int) -> Float[np.ndarray, "n 3"]:
+            return _sd(problem, weights[k], closed[k].frame, known, jnp.asarray(anew.states[k]))
+
+        return np.concatenate([found[counted[k]] for k, found in side_by_side(one, frames).items()])
+
+    off = np.concatenate([(np.asarray(closed[k].frame.y) - anew.seen[k])[counted[k]] for k in frames])
+    return Foretold(off=off, reckon=sd)
 
 
 def from_rest(problem: Problem, point: Point, frames: list[int], *, by_tool: bool) -> Point:

@@ -14,8 +14,9 @@ from jiggle_mj.estimator.attribution.linear import N_FIELDS, Metric
 from jiggle_mj.estimator.attribution.normal_equations import less_offset
 from jiggle_mj.estimator.attribution.problem import Problem
 
-VARIANCES = (1.0, 4.0, 16.0, 64.0)
-"""Of the forces, in units of the usual."""
+RATIO = 4.0
+VARIANCES = (1.0, RATIO, RATIO**2, RATIO**3)
+"""Of the forces, in units of the usual; from where one is less likely than the one before on, none is tried."""
 AMPLITUDES = (0.25, 1.0, 4.0, 16.0)
 """Of the smooth fields, in units of the usual."""
 
@@ -38,6 +39,8 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
     """Of a fit."""
     likelihoods: dict[tuple[float, float], float] = {}
     for variance in VARIANCES:
+        if likelihoods and max(likelihoods, key=lambda key: likelihoods[key])[0] < variance / RATIO:
+            break
         wider = problem.widened(variance, problem.amplitude)
         weights = fitted.weights if variance == 1.0 else weighed(wider, fitted.point, list(fitted.weights))
         whole = sum(float(_log_determinant(one)) for one in weights.values())

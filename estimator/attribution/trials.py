@@ -35,11 +35,21 @@ class Trial:
     """Against the fit without it, the lesser under either's weights."""
     at: np.ndarray
     """Which parameters are its own."""
-    theta: np.ndarray
-    sd: np.ndarray
-    """By the fit's own errors, or by how far parts left out change them, whichever is more."""
+    sds: np.ndarray
+    """Of all that are named in the fit: by its own errors, or by how far parts left out change them, whichever is
+    more."""
     left: Leftover | None = None
     folds: list[Foretold] | None = None
+
+    @property
+    def theta(self) -> np.ndarray:
+        """Its size."""
+        return self.fitted.point.theta[self.at]
+
+    @property
+    def sd(self) -> np.ndarray:
+        """Of its size."""
+        return self.sds[np.isin(self.fitted.named, self.at)]
 
     @property
     def missed(self) -> float:
@@ -93,8 +103,8 @@ def judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str], 
     left = leftover(problem, trial.fitted)
     fits = left_out(problem, trial.fitted, used)
     folds = [foretell(problem, one, part) for part, one in fits.items()]
-    thetas = [one.point.theta[trial.at] for one in fits.values()]
-    found = replace(trial, left=left, folds=folds, sd=np.maximum(trial.sd, jackknife_sd(thetas, len(trial.at))))
+    thetas = [one.point.theta[trial.fitted.named] for one in fits.values()]
+    found = replace(trial, left=left, folds=folds, sds=np.maximum(trial.sds, jackknife_sd(thetas, len(trial.sds))))
     foretold = f", foretells to {1e3 * found.missed:.2f} mm" if found.folds else ""
     say(f"{trial.effect.name} leaves {left.gain:.1f} nat to larger errors{foretold}")
     return found
@@ -113,8 +123,7 @@ def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial],
         fitted=fitted,
         log_bayes_factor=bayes_factor(problem, fitted, before, effect.sites)[1],
         at=at,
-        theta=fitted.point.theta[at],
-        sd=occam(problem, fitted)[1][-len(at) :],
+        sds=occam(problem, fitted)[1],
     )
 
 

@@ -1,0 +1,178 @@
+"""The panel of closing the loop: what a scene holds and nobody declares, a row each.
+
+A sheet that is attached along an arc is lifted at four corners and one edge, and let down; particles are seen with
+noise half of which neighbours share. What would belong to the rest shape if it were there from the start begins after
+the still frames.
+"""
+
+from dataclasses import dataclass, replace
+
+from jiggle_mj.scenes import Scene, load_scene
+from jiggle_mj.scenes.anchor_disturbances import (
+    AnchorBreak,
+    AnchorCreep,
+    AnchorShift,
+    AnchorYield,
+    GraspSlip,
+    PointPull,
+)
+from jiggle_mj.scenes.disturbance import Disturbance
+from jiggle_mj.scenes.observer import Sensing
+from jiggle_mj.scenes.report_disturbances import (
+    CameraBias,
+    CameraDrift,
+    DepthScale,
+    ImageLatency,
+    Inertia,
+    PointSlip,
+    ToolLatency,
+    ToolScale,
+    ToolTurn,
+)
+from jiggle_mj.scenes.sheet_disturbances import (
+    Anisotropy,
+    Bending,
+    Heterogeneity,
+    Inclusion,
+    MaterialDamping,
+    PreStrain,
+    StrainStiffening,
+    Stretch,
+    TissueCreep,
+    TissueYield,
+)
+from jiggle_mj.scenes.world_disturbances import Bed, Friction, Gravity, ViscousDrag
+
+LATE = 2.2
+"""When what would else be in the rest shape begins: after the still frames, before the first grasp [s]."""
+MOVING, SLOW = Inertia(magnitude=0.02), 0.03
+"""Frames that are taken while the tool has just stopped, and how fast it goes there [m/s]: that a report comes late
+shows in no sheet at rest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One line of the table."""
+
+    disturbances: tuple[Disturbance, ...] = ()
+    effects: tuple[str, ...] = ()
+    """Their names in the library; none where it has none, or where there is nothing to name."""
+    sensing: Sensing = "particles"
+    spacing: float = 6.5e-3
+    """Edge length of the reference's mesh [m]; particles are its vertices, points are as many whatever it is."""
+    smooth_share: float = 0.5
+    """Of the noise's variance, what neighbours share."""
+
+
+def inside(effect: str, *disturbances: Disturbance) -> Row:
+    """A row of one effect that the library has."""
+    return Row(effects=(effect,), disturbances=disturbances)
+
+
+INSIDE: dict[str, Row] = {
+    "gravity x 0.3": inside("gravity", Gravity(magnitude=0.3, start=LATE)),
+    "gravity leaning": inside("gravity", Gravity(magnitude=1.0, tilt_deg=25, azimuth_deg=30, start=LATE)),
+    "bed lower": inside("bed", Bed(magnitude=-0.003, start=LATE)),
+    "friction": inside("friction", Friction(magnitude=1.0)),
+    "viscous drag": inside("viscous_drag", ViscousDrag(magnitude=2.0), MOVING),
+    "material damping": inside("material_damping", MaterialDamping(magnitude=0.5), MOVING),
+    "tissue creep": inside("tissue_creep", TissueCreep(magnitude=0.3)),
+    "inclusion": inside("inclusion", Inclusion(magnitude=8, centre=(-0.02, -0.02), radius=0.015)),
+    "heterogeneity": inside("heterogeneity", Heterogeneity(magnitude=0.8)),
+    "anisotropy": inside("anisotropy", Anisotropy(magnitude=3.0)),
+    "stretch": inside("stretch", Stretch(magnitude=2.5)),
+    "bending": inside("bending", Bending(magnitude=15)),
+    "pre-strain": inside("pre_strain", PreStrain(magnitude=0.03, start=LATE)),
+    "stiffening": inside("strain_stiffening", StrainStiffening(magnitude=400)),
+    "point pull": inside("point_pull", PointPull(magnitude=3.0, at=(0.02, 0.02), start=LATE)),
+    "anchor shift": inside("anchor_shift", AnchorShift(magnitude=0.003, direction=(1.0, 0.3, 0.0), start=LATE)),
+    "anchor creep": inside("anchor_creep", AnchorCreep(magnitude=0.5)),
+    "tool scale": inside("tool_scale", ToolScale(magnitude=1.08)),
+    "tool turn": inside("tool_turn", ToolTurn(magnitude=4.0)),
+    "tool latency": inside("tool_latency", ToolLatency(magnitude=0.2), MOVING),
+    "image latency": inside("image_latency", ImageLatency(magnitude=0.2), MOVING),
+    "camera bias": inside("camera_bias", CameraBias(magnitude=0.003, pitch_deg=1.0, start=LATE)),
+    "camera drift": inside("camera_drift", CameraDrift(magnitude=0.0003, roll_deg=0.05, start=LATE)),
+    "depth scale": inside("depth_scale", DepthScale(magnitude=1.03, start=LATE)),
+    "point slip": inside("point_slip", PointSlip(magnitude=0.0002)),
+}
+"""One effect of the library each."""
+
+
+def _together(*names: str) -> Row:
+    rows = [INSIDE[name] for name in names]
+    return Row(
+        effects=tuple(effect for row in rows for effect in row.effects),
+        disturbances=tuple(sorted((one for row in rows for one in row.disturbances), key=lambda one: one.start)),
+    )
+
+
+TOGETHER: dict[str, Row] = {
+    " and ".join(names): _together(*names)
+    for names in (
+        ("gravity x 0.3", "tool scale"),
+        ("bed lower", "camera bias"),
+        ("stretch", "image latency"),
+        ("anisotropy", "depth scale"),
+        ("point pull", "tool turn"),
+        ("bending", "tissue creep"),
+    )
+}
+"""Two effects at once."""
+IMAGES: dict[str, Row] = {
+    f"{name}, images": replace(INSIDE[name], sensing="stereo")
+    for name in ("gravity leaning", "stretch", "bed lower", "point pull", "tool scale", "image latency")
+}
+"""The same from a stereo pair."""
+OUTSIDE: dict[str, Row] = {
+    "grasp slips": Row(disturbances=(GraspSlip(magnitude=0.006),)),
+    "tissue yields": Row(disturbances=(TissueYield(magnitude=0.1),)),
+    "anchors yield": Row(disturbances=(AnchorYield(magnitude=0.0015),)),
+    "anchors break": Row(disturbances=(AnchorBreak(magnitude=0.01),)),
+}
+"""What the library leaves out."""
+NOTHING: dict[str, Row] = {
+    "nothing": Row(),
+    "nothing, white noise": Row(smooth_share=0.0),
+    "nothing, shared noise": Row(smooth_share=0.8),
+    "nothing, finer reference": Row(sensing="points", spacing=3.25e-3),
+    "nothing, images": Row(sensing="stereo"),
+}
+"""Nothing that is undeclared: what is named there is a false alarm."""
+GROUPS = {"inside": INSIDE, "together": TOGETHER, "images": IMAGES, "outside": OUTSIDE, "nothing": NOTHING}
+ROWS = {name: row for rows in GROUPS.values() for name, row in rows.items()}
+NOISE = 1.5e-4 * 2**0.5
+"""Standard deviation of a coordinate, of all noise [m]."""
+
+
+def scene_with(name: str, seed: int) -> Scene:
+    """The arc on a coarser sheet, with more grasps, shared noise, and what the row of this name holds."""
+    arc, row = load_scene("arc"), ROWS[name]
+    pulls = replace(
+        arc.programme,
+        still_frames=20,
+        points=((-0.047, -0.047), (0.047, -0.047), (0.047, 0.047), (-0.047, 0.047), (0.0, -0.048)),
+        height=0.035,
+        increments=5,
+        lowering=1,
+    )
+    noise = replace(
+        arc.sensing,
+        point_sd=NOISE * (1 - row.smooth_share) ** 0.5,
+        smooth_sd=NOISE * row.smooth_share**0.5,
+        smooth_length=0.012,
+        n_points=300,
+    )
+    return replace(
+        arc,
+        name=f"undeclared, {name}",
+        seed=seed,
+        secret=True,
+        tissue=replace(arc.tissue, spacing=row.spacing, mesh="unstructured", seed=seed),
+        bed=replace(arc.bed, friction=0.1),
+        attachments=(replace(arc.attachments[0], width=0.0115, stiffness=2.0),),
+        tweezer=replace(arc.tweezer, radius=8e-3, speed=SLOW if MOVING in row.disturbances else arc.tweezer.speed),
+        programme=pulls,
+        sensing=noise,
+        disturbances=row.disturbances,
+    )
