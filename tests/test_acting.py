@@ -21,7 +21,7 @@ from jiggle_mj.limits import Limits
 from jiggle_mj.observation import Action, Declaration, Grasp, Move, Release, Wait
 from jiggle_mj.policies import POLICIES
 
-PAPERS = ("sl-d", "pmp-up", pytest.param("lg-d", marks=pytest.mark.slow), pytest.param("lg-h", marks=pytest.mark.slow))
+PAPERS = ("pmp-up", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sl-d", "lg-d", "lg-h")))
 
 
 @pytest.fixture(scope="module")

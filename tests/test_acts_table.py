@@ -4,6 +4,7 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import pytest
 from jiggle_mj.eval import acts_table
 from jiggle_mj.eval.acts_table import Verdict, limit, markdown, measure, verdicts
 from jiggle_mj.scenes import load_scene
@@ -14,6 +15,7 @@ from jiggle_mj.recording_declaration import VERSION
 GOOD, BAD = Verdict("Cut", True, 9.0), Verdict("Cut", False, -9.0)
 
 
+@pytest.mark.slow
 def test_a_small_tissue_tells_cuts_that_worked_from_those_that_did_not(tmp_path, monkeypatch):
     monkeypatch.setattr(acts_table, "PLACES", 1)
     found = verdicts(load_scene(str(scene_file(tmp_path, text=SCENE))), 0)

@@ -159,7 +159,7 @@ def test_a_pull_is_suggested_that_tells_more_than_the_first_lift_did(light):
     with jax.enable_x64(True), one_thread():
         found = suggest(closed, gathered)
         assert found is not None and set(found.between) == {"gravity", "stretch"}
-        fits = [closed.stages[1].fitted, *(one.fitted for one in closed.rivals[0])]
+        fits = [one.fitted for one in (closed.accepted[0], *closed.rivals[0])]
         first = [one for one in gathered.frames if one.grasp == 1][:4]
         assert found.expected > told_apart(closed.problem, fits, first) > 0
         assert told_apart(closed.problem, [fits[0], fits[0]], first) == pytest.approx(0, abs=1)

@@ -45,7 +45,8 @@ def estimated(stiffness: float, seed: int) -> Estimator:
     return estimator
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_disc_of_one_newton_a_metre_is_found(seed):
     """The bars of the shipped scenes: 0.95 within one ring, and exactly all but a few."""
     reported = estimated(1.0, seed).detection.attached

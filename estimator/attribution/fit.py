@@ -6,11 +6,8 @@ more. Stiffnesses go where samples of the belief say.
 """
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -20,12 +17,10 @@ from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, Mis
 from jiggle_mj.estimator.attribution.normal_equations import less_offset, reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
+from jiggle_mj.estimator.attribution.side_by_side import side_by_side
 from jiggle_mj.estimator.effects.sheet_model import Moment
 from jiggle_mj.estimator.filters.implicit import reconsidered
 
-from jiggle_mj.worker_processes import usable_cores
-
-T = TypeVar("T")
 ODDS = 2.2
 """What an attachment costs: the logarithm of nine to one [nat]."""
 STIFFEST = 0.98
@@ -186,18 +181,6 @@ def linearised(
         return glance(problem.sheet, weights[k], theta, along_, frame, moment)
 
     return side_by_side(one, moments)
-
-
-def side_by_side(of: Callable[[int], T], frames: Iterable[int]) -> dict[int, T]:
-    """A function of each frame, on all usable cores: compiled code and BLAS leave the interpreter to other threads."""
-    frames, wide = list(frames), jax.config.jax_enable_x64
-
-    def one(k: int) -> T:
-        with jax.enable_x64(wide):  # which is said by thread
-            return of(k)
-
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        return dict(zip(frames, pool.map(one, frames), strict=True))
 
 
 def _moments(

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.fit import Fitted, side_by_side, weighed
+from jiggle_mj.estimator.attribution.fit import Fitted, weighed
 from jiggle_mj.estimator.attribution.linear import Metric
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
+from jiggle_mj.estimator.attribution.side_by_side import side_by_side
 from scipy.stats import norm
 
 ROUNDS = 2

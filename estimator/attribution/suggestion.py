@@ -55,12 +55,11 @@ class Suggestion:
 
 def suggest(closed: Closed, gathered: Gathered, *, say: Callable[[str], None] = lambda _: None) -> Suggestion | None:
     """Of the pulls that are tried, the one that is expected to tell most; None if there is nothing to tell apart."""
-    added = zip(closed.accepted, closed.stages[1:], closed.rivals, strict=True)
-    open_ = [one for one in added if one[2]]
+    open_ = [[best, *rivals] for best, rivals in zip(closed.accepted, closed.rivals, strict=True) if rivals]
     if not open_:
         return None
-    best, stage, rivals = open_[-1]
-    fits, names = [stage.fitted, *(one.fitted for one in rivals)], tuple(one.effect.name for one in (best, *rivals))
+    trials = open_[-1]
+    fits, names = [one.fitted for one in trials], tuple(one.effect.name for one in trials)
     say(f"looking for a pull that tells {', '.join(names)} apart")
     rest, far, gap, radius = gathered.estimator.sheet.rest, *_usual(gathered)
     places = far_apart(rest, PLACES).tolist()
@@ -69,9 +68,9 @@ def suggest(closed: Closed, gathered: Gathered, *, say: Callable[[str], None] = 
         frames = _frames(gathered, place, far * direction, gap=gap, radius=radius)
         return told_apart(closed.problem, fits, frames), place, far * direction
 
-    pulls = sorted((tried(place, UP[0]) for place in places), key=lambda one: -one[0])
-    pulls += [tried(place, direction) for _, place, _ in pulls[:BEST] for direction in SLANTED]
-    expected, place, pull = max(pulls, key=lambda one: one[0])
+    best = sorted((tried(place, UP[0]) for place in places), key=lambda one: -one[0])
+    best += [tried(place, direction) for _, place, _ in best[:BEST] for direction in SLANTED]
+    expected, place, pull = max(best, key=lambda one: one[0])
     return Suggestion(grasp=rest[place], pull=pull, hold=HOLD, expected=expected, between=names)
 
 

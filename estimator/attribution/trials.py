@@ -24,7 +24,7 @@ START = 2.0
 """Prior standard deviations within which a fit begins."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Trial:
     """An effect, fitted."""
 

@@ -1,0 +1,60 @@
+"""Effects against each other, and against having none: by what they explain, and by what they foretell."""
+
+from jiggle_mj.estimator.attribution.held_out import Foretold
+from jiggle_mj.estimator.attribution.trials import ABSURD, ENTER, Stage, Trial
+
+LEAD = 3.0
+"""By how much an effect must lead the next to be named alone, whatever the shares [nat]."""
+AS_GOOD, CONFUSED = 0.9, 0.6
+"""Shares of its error from which an effect counts as no worse than the best, and one that is often confused with it."""
+EXPLAINED = 0.85
+"""Share of the best log Bayes factor from which an effect counts as explaining as much."""
+BETTER, DECISIVE = 0.97, 0.8
+"""Shares of the error over all parts left out that an effect must bring it to, and from which on it need not beat
+larger errors without a cause."""
+
+
+def best(passed: list[Trial]) -> Trial:
+    """The likeliest of those that foretell about as well as the one that does it best."""
+    if not passed[0].folds:
+        return max(passed, key=lambda one: one.log_bayes_factor)
+    least = min(one.missed for one in passed)
+    return max((one for one in passed if one.missed * AS_GOOD <= least), key=lambda one: one.log_bayes_factor)
+
+
+def behind(one: Trial, best: Trial) -> str:
+    """Why an effect is neither added nor named beside the best."""
+    if best.folds and best.missed < one.missed * AS_GOOD:
+        return f"{best.effect.name} foretells better, to {1e3 * best.missed:.2f} mm against {1e3 * one.missed:.2f}"
+    return f"{best.effect.name} is likelier by {best.log_bayes_factor - one.log_bayes_factor:.0f} nat"
+
+
+def not_told_from(one: Trial, best: Trial) -> bool:
+    """Whether an effect explains as much as the best, and foretells what was left out about as well.
+
+    For two that are often confused with each other it takes less.
+    """
+    likelier = best.log_bayes_factor - one.log_bayes_factor
+    if not best.folds:
+        return likelier < LEAD
+    if one.effect.name in best.effect.confounded_with and best.effect.name in one.effect.confounded_with:
+        return one.missed * CONFUSED <= best.missed
+    as_likely = likelier < max(LEAD, (1 - EXPLAINED) * best.log_bayes_factor)
+    return as_likely and one.missed * AS_GOOD <= best.missed
+
+
+def against(best: Trial, stage: Stage) -> str | None:
+    """Why an effect is not added; None if it is."""
+    assert best.left is not None and best.folds is not None
+    if not best.sensible:
+        return f"its size is beyond {ABSURD:g} prior standard deviations"
+    before, after = (Foretold.together(parts).rms if parts else 1.0 for parts in (stage.folds, best.folds))
+    if after > DECISIVE * before and best.log_bayes_factor + best.left.gain < stage.left.gain + ENTER:
+        return "larger errors without a cause explain the frames as well"
+    better = sum(b.rms < a.rms for a, b in zip(stage.folds, best.folds, strict=True))
+    if stage.folds and (after > BETTER * before or 2 * better < len(stage.folds)):
+        return (
+            f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
+            f"better in {better} of {len(stage.folds)}"
+        )
+    return None

@@ -1,0 +1,86 @@
+"""Effects against each other and against none, by numbers made up for it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from jiggle_mj.estimator.attribution.comparison import against, behind, best, not_told_from
+from jiggle_mj.estimator.attribution.held_out import Foretold
+from jiggle_mj.estimator.attribution.leftover import Leftover
+from jiggle_mj.estimator.attribution.trials import Stage, Trial
+from jiggle_mj.estimator.effects import LIBRARY
+
+EFFECTS = {one.name: one for one in LIBRARY}
+
+
+def foretold(*errors_mm: float) -> list[Foretold]:
+    """Parts that are each missed by so much."""
+    return [Foretold(off=np.array([[1e-3 * one, 0.0, 0.0]]), reckon=lambda: np.ones((1, 3))) for one in errors_mm]
+
+
+def leaving(gain: float) -> Leftover:
+    return Leftover(gain=gain, variance=1.0, amplitude=1.0, tool_variance=1.0)
+
+
+def trial(name: str, gain: float, *errors_mm: float, left: float = 0.0, theta: float = 0.01) -> Trial:
+    """An effect of so much evidence, with nothing else of a fit than its first parameter."""
+    effect, one = EFFECTS[name], object.__new__(Trial)
+    point = SimpleNamespace(theta=np.full(len(effect.prior_sd), theta * np.asarray(effect.prior_sd)))
+    vars(one).update(
+        effect=effect,
+        fitted=SimpleNamespace(point=point),
+        at=np.arange(len(effect.prior_sd)),
+        log_bayes_factor=gain,
+        left=leaving(left),
+        folds=foretold(*errors_mm),
+    )
+    return one
+
+
+def stage(*errors_mm: float, left: float = 0.0) -> Stage:
+    one = object.__new__(Stage)
+    vars(one).update(folds=foretold(*errors_mm), left=leaving(left))
+    return one
+
+
+def test_the_likeliest_of_those_that_foretell_as_well_is_the_best():
+    likely, sharp, blunt = (
+        trial("gravity", 300.0, 0.54, 0.54),
+        trial("stretch", 200.0, 0.5, 0.5),
+        trial("bed", 900.0, 0.7, 0.7),
+    )
+    assert best([blunt, likely, sharp]) is likely
+    assert "foretells better, to 0.54 mm against 0.70" in behind(blunt, likely)
+    assert behind(trial("bending", 100.0, 0.5, 0.5), likely) == "gravity is likelier by 200 nat"
+
+
+@pytest.mark.parametrize(
+    ("name", "gain", "error", "told"),
+    [
+        ("friction", 290.0, 0.5, False),  # as likely, as good
+        ("friction", 200.0, 0.5, True),  # less likely
+        ("friction", 290.0, 0.6, True),  # foretells worse
+        ("stretch", 100.0, 0.8, False),  # often confused: less is enough
+        ("stretch", 100.0, 0.9, True),
+    ],
+)
+def test_what_cannot_be_told_from_the_best(name, gain, error, told):
+    first = trial("gravity", 300.0, 0.5, 0.5)
+    assert not_told_from(trial(name, gain, error, error), first) is not told
+
+
+@pytest.mark.parametrize(
+    ("one", "why"),
+    [
+        (trial("gravity", 300.0, 0.5, 0.5, 0.5, 0.5), None),
+        (trial("gravity", 300.0, 0.5, 0.5, 1.01, 1.01), None),  # half of them is enough
+        (trial("gravity", 300.0, 0.5, 1.01, 1.01, 1.01), "better in 1 of 4"),
+        (trial("gravity", 300.0, 0.98, 0.98, 0.98, 0.98), "0.98 mm with it and 1.00 mm without, better in 4 of 4"),
+        (trial("gravity", 15.0, 0.9, 0.9, 0.9, 0.9), "larger errors without a cause explain"),
+        (trial("gravity", 15.0, 0.7, 0.7, 0.7, 0.7), None),  # foretelling decides
+        (trial("gravity", 300.0, 0.5, 0.5, 0.5, 0.5, theta=4.0), "beyond 3.5 prior standard deviations"),
+    ],
+)
+def test_what_is_not_added_and_why(one, why):
+    said = against(one, stage(1.0, 1.0, 1.0, 1.0, left=20.0))
+    assert said is None if why is None else why in (said or "")
