@@ -35,8 +35,8 @@ def story(found: Mapping[str, Any]) -> list[str]:
         told.append(f"Added: {one['name']} ({sizes}), log Bayes factor {one['log_bayes_factor']:.0f}.")
         if one["this_session_alone"]:
             told.append(f"{one['name']} is of the tool, camera or tracker, and holds for this session alone.")
-    if found["ambiguous_with"]:
-        told.append(f"It may as well be: {', '.join(found['ambiguous_with'])}.")
+        if one["not_told_from"]:
+            told.append(f"Instead of {one['name']} it may as well be: {', '.join(one['not_told_from'])}.")
     told += [f"Refused: {one['name']}, since {one['why']}." for one in found["refused"]]
     held = found["held_out"]
     if held["folds"] and found["effects"]:

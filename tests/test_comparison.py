@@ -84,3 +84,10 @@ def test_what_cannot_be_told_from_the_best(name, gain, error, told):
 def test_what_is_not_added_and_why(one, why):
     said = against(one, stage(1.0, 1.0, 1.0, 1.0, left=20.0))
     assert said is None if why is None else why in (said or "")
+
+
+def test_what_accounts_for_all_that_was_left_over_need_only_foretell_no_worse():
+    before = stage(1.0, 1.0, left=100.0)
+    assert against(trial("gravity", 300.0, 0.99, 0.99, left=20.0), before) is None
+    assert against(trial("gravity", 300.0, 0.99, 0.99, left=80.0), before) is not None
+    assert against(trial("gravity", 300.0, 1.01, 1.01, left=20.0), before) is not None

@@ -15,8 +15,8 @@ from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import leftover
 from jiggle_mj.estimator.attribution.problem import Problem
-from jiggle_mj.estimator.attribution.search import MOST, REMAINDER, Added, Refused, following, revised
-from jiggle_mj.estimator.attribution.trials import Stage, Trial, left_out
+from jiggle_mj.estimator.attribution.search import MOST, Added, Refused, following, revised
+from jiggle_mj.estimator.attribution.trials import REMAINDER, Stage, Trial, left_out
 from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.effects import LIBRARY, Effect
 
@@ -79,7 +79,9 @@ def close_the_loop(
         stages.append(added[-1].stage)
     accepted, names = [one.trial for one in added], {one.trial.effect.name for one in added}
     rivals = [[one for one in group.rivals if one.effect.name not in names] for group in added]
-    refused += [pair for group in added for pair in group.others if pair not in refused]
+    refused += [pair for group in added for pair in group.others]
+    last_said = {one.effect.name: (one, why) for one, why in refused}
+    named = names | {one.effect.name for group in rivals for one in group}
     reported = None
     if spare is not None:
         before = foretell(problem, stages[0].fitted, spare)
@@ -94,7 +96,7 @@ def close_the_loop(
         verdict=verdict,
         accepted=accepted,
         rivals=rivals,
-        refused=[pair for pair in refused if pair[0].effect.name not in names],
+        refused=[pair for name, pair in last_said.items() if name not in named],
         stages=stages,
         final=final,
         reported=reported,

@@ -1,7 +1,7 @@
 """Effects against each other, and against having none: by what they explain, and by what they foretell."""
 
 from jiggle_mj.estimator.attribution.held_out import Foretold
-from jiggle_mj.estimator.attribution.trials import ABSURD, ENTER, Stage, Trial
+from jiggle_mj.estimator.attribution.trials import ABSURD, ENTER, REMAINDER, Stage, Trial
 
 LEAD = 3.0
 """By how much an effect must lead the next to be named alone, whatever the shares [nat]."""
@@ -10,8 +10,8 @@ AS_GOOD, CONFUSED = 0.9, 0.6
 EXPLAINED = 0.85
 """Share of the best log Bayes factor from which an effect counts as explaining as much."""
 BETTER, DECISIVE = 0.97, 0.8
-"""Shares of the error over all parts left out that an effect must bring it to, and from which on it need not beat
-larger errors without a cause."""
+"""Shares of the error over all parts left out that an effect must bring it to, unless it accounts for all that was left
+over, and from which on it need not beat larger errors without a cause."""
 
 
 def best(passed: list[Trial]) -> Trial:
@@ -52,7 +52,8 @@ def against(best: Trial, stage: Stage) -> str | None:
     if after > DECISIVE * before and best.log_bayes_factor + best.left.gain < stage.left.gain + ENTER:
         return "larger errors without a cause explain the frames as well"
     better = sum(b.rms < a.rms for a, b in zip(stage.folds, best.folds, strict=True))
-    if stage.folds and (after > BETTER * before or 2 * better < len(stage.folds)):
+    enough = 1.0 if best.left.gain < REMAINDER < stage.left.gain else BETTER
+    if stage.folds and (after > enough * before or 2 * better < len(stage.folds)):
         return (
             f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
             f"better in {better} of {len(stage.folds)}"

@@ -17,7 +17,7 @@ def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | Non
     noise, before = gathered.noise, localisation(closed.problem, first.fitted)
     return {
         "verdict": closed.verdict,
-        "effects": [_effect(closed, one) for one in closed.accepted],
+        "effects": [_effect(*each) for each in zip(closed.accepted, closed.rivals, strict=True)],
         "ambiguous_with": list(dict.fromkeys(one.effect.name for rivals in closed.rivals for one in rivals)),
         "refused": [{"name": one.effect.name, "why": why} for one, why in closed.refused],
         "tested": [effect.name for effect in closed.problem.sheet.library],
@@ -61,7 +61,7 @@ def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | Non
     }
 
 
-def _effect(closed: Closed, one: Trial) -> dict[str, Any]:
+def _effect(one: Trial, rivals: list[Trial]) -> dict[str, Any]:
     return {
         "name": one.effect.name,
         "site": one.score.site if one.effect.sites > 1 else None,
@@ -71,6 +71,7 @@ def _effect(closed: Closed, one: Trial) -> dict[str, Any]:
         "log_bayes_factor": one.log_bayes_factor,
         "p_value": one.score.p_value,
         "this_session_alone": one.effect.sensing,
+        "not_told_from": [rival.effect.name for rival in rivals],
         "often_confused_with": list(one.effect.confounded_with),
     }
 

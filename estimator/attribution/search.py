@@ -14,10 +14,8 @@ from jiggle_mj.estimator.attribution.comparison import against, behind, best, no
 from jiggle_mj.estimator.attribution.fit import Fitted, fit, moved
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.attribution.scores import bayes_factor, occam
-from jiggle_mj.estimator.attribution.trials import COMPARED, ENTER, Stage, Trial, fitted_trials, judged
+from jiggle_mj.estimator.attribution.trials import COMPARED, ENTER, REMAINDER, Stage, Trial, fitted_trials, judged
 
-REMAINDER = 60.0
-"""What larger errors without a cause may gain before something is said to be left over [nat]."""
 MOST = 3
 """Effects that are added at most."""
 Say = Callable[[str], None]

@@ -15,6 +15,8 @@ LOOKED_AT = 3
 """Effects that are fitted, the likeliest by their scores."""
 ENTER = 10.0
 """Log Bayes factor from which an effect is looked at, and with which it must lead what has no name [nat]."""
+REMAINDER = 60.0
+"""What larger errors without a cause may gain before something is said to be left over [nat]."""
 COMPARED = 0.5
 """Share of the best log Bayes factor from which effects are compared by what they foretell; and fitted, if often
 confused with the best."""
@@ -83,7 +85,7 @@ def fitted_trials(
     trials = [_fitted(problem, stage, one, accepted, used) for one in _likely(problem, found)]
     for one in trials:
         say(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
-    trials = [one for one in trials if one.log_bayes_factor > ENTER]
+    trials = [one for one in trials if one.log_bayes_factor > ENTER and np.any(one.theta != 0)]
     return sorted(trials, key=lambda one: (not one.sensible, -one.log_bayes_factor))
 
 
