@@ -125,6 +125,17 @@ def test_a_tool_that_goes_further_than_it_says_is_named():
     assert found["effects"][0]["this_session_alone"]
 
 
+@pytest.mark.slow
+def test_two_effects_at_once_are_both_named_with_what_each_cannot_be_told_from():
+    closed, found, _ = closed_over(seen(0.2, tool_scale=1.1))
+    names = {effect["name"] for effect in found["effects"]}
+    assert names <= {"gravity", "stretch", "tool_scale"} and len(names) == 2, story(found)
+    assert {"gravity", "tool_scale"} <= names | set(found["ambiguous_with"])
+    scale = next(effect for effect in found["effects"] if effect["name"] == "tool_scale")
+    assert scale["theta"][0] == pytest.approx(np.log(1.1), abs=0.02)
+    assert all(one.fitted is closed.stages[-1].fitted for one in closed.accepted)
+
+
 def test_a_hold_that_slips_is_not_explained_by_larger_forces():
     """From the second increment of each lift on, the jaws have gone a centimetre further than what they hold."""
     slipped = [dataclasses.replace(one, tool=_further(one.tool)) if _late(one) else one for one in seen(1.0)]

@@ -4,9 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from jiggle_mj.estimator.attribution import search
 from jiggle_mj.estimator.attribution.comparison import against, behind, best, not_told_from
 from jiggle_mj.estimator.attribution.held_out import Foretold
 from jiggle_mj.estimator.attribution.leftover import Leftover
+from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.attribution.trials import Stage, Trial
 from jiggle_mj.estimator.effects import LIBRARY
 
@@ -91,3 +93,28 @@ def test_what_accounts_for_all_that_was_left_over_need_only_foretell_no_worse():
     assert against(trial("gravity", 300.0, 0.99, 0.99, left=20.0), before) is None
     assert against(trial("gravity", 300.0, 0.99, 0.99, left=80.0), before) is not None
     assert against(trial("gravity", 300.0, 1.01, 1.01, left=20.0), before) is not None
+
+
+def test_each_but_the_last_is_compared_again_with_what_was_tried_in_its_place(monkeypatch):
+    """The first is exchanged for what does better beside the others, the second stays, and the order with them."""
+    first, second, third = (trial(name, 300.0, 0.5) for name in ("gravity", "tool_scale", "friction"))
+    rival, unlikely = trial("stretch", 250.0, 0.5), trial("bed", 100.0, 0.5)
+    added = [
+        search.Added(trial=first, rivals=[rival], others=[(unlikely, "less likely"), (third, "added later")]),
+        search.Added(trial=second, rivals=[], others=[]),
+        search.Added(trial=third, rivals=[], others=[]),
+    ]
+    asked = []
+
+    def beside(problem, last, one, others, used, say):
+        asked.append([one.effect.name, *(other.effect.name for other in others)])
+        gains = {"gravity": 100.0, "stretch": 280.0, "tool_scale": 300.0}
+        return None, [trial(other.effect.name, gains[other.effect.name], 0.5) for other in (one, *others)]
+
+    monkeypatch.setattr(search, "_beside", beside)
+    monkeypatch.setattr(search, "_with", lambda one, last: one)
+    monkeypatch.setattr(search, "replace", lambda one, trial: search.Added(trial=trial, rivals=one.rivals, others=[]))
+    found = search.revised(object.__new__(Problem), added, set(), lambda said: None)
+    assert asked == [["gravity", "stretch"], ["tool_scale"]]
+    assert [one.trial.effect.name for one in found] == ["stretch", "tool_scale", "friction"]
+    assert [one.effect.name for one in found[0].rivals] == ["gravity"]

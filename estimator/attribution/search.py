@@ -63,8 +63,8 @@ def following(
 
 def revised(problem: Problem, added: list[Added], used: set[int], say: Say) -> list[Added]:
     """Each but the last compared again with what was tried in its place; dropped where it is not needed any more."""
-    for k, one in enumerate(added[:-1]):
-        rest = [*added[:k], *added[k + 1 :]]
+    for k in range(len(added) - 1):
+        one, rest = added[k], [*added[:k], *added[k + 1 :]]
         names = [other.trial.effect.name for other in rest]
         say(f"{one.trial.effect.name} again, beside {' and '.join(names)}")
         others = [trial for trial in _else(one) if trial.effect.name not in names]
@@ -75,7 +75,8 @@ def revised(problem: Problem, added: list[Added], used: set[int], say: Say) -> l
             last = judged(problem, replace(rest[-1].trial, fitted=plain, sds=occam(problem, plain)[1]), used, say)
             return [replace(other, trial=_with(other.trial, last)) for other in rest]
         again = _chosen(needed, [pair for pair in one.others if pair[0] not in others])
-        added = [again if other is one else replace(other, trial=_with(other.trial, again.trial)) for other in added]
+        rest = [replace(other, trial=_with(other.trial, again.trial)) for other in rest]
+        added = [*rest[:k], again, *rest[k:]]
     return added
 
 
