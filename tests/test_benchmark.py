@@ -7,6 +7,7 @@ import pytest
 from jiggle_mj.eval import benchmark as bench
 
 
+@pytest.mark.slow
 def test_a_small_benchmark_has_its_figures_and_finds_the_disc():
     """A sheet of 9 by 9 particles, as in other tests."""
     metrics = bench.benchmark((85,), paper=False, say=lambda _: None)

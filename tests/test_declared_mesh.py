@@ -71,6 +71,7 @@ def folder(tmp_path_factory):
     return where
 
 
+@pytest.mark.slow
 def test_the_hold_is_suspected_where_nothing_is_seen_and_nowhere_else(folder, tmp_path):
     """Five frames say that the strip is held beyond the view, not which particles hold it: P(attached) is spread there.
 

@@ -126,6 +126,7 @@ def test_nan_points_are_unseen_particles():
     assert np.linalg.norm(lifts()[1].x - lifts()[2].x, axis=1)[hidden].max() > 2e-3
 
 
+@pytest.mark.slow
 def test_clouds_without_identities_are_followed_by_a_mesh_of_the_estimators_own():
     """Against the same surface without noise."""
     estimator, states = Estimator(DECLARATION, config=EstimatorConfig(spacing=SPACING)), [sheet().rest] * 2

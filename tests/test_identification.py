@@ -51,6 +51,7 @@ def runs() -> list[tuple]:
     return found
 
 
+@pytest.mark.slow
 def test_the_truth_is_found_within_its_standard_errors(runs):
     """Also in the mean over the seeds, where a bias would show."""
     scores = np.array(
@@ -65,10 +66,12 @@ def test_the_truth_is_found_within_its_standard_errors(runs):
     assert (np.abs(scores.mean(axis=0)) < 3 / np.sqrt(len(SEEDS))).all()
 
 
+@pytest.mark.slow
 def test_standard_errors_say_something(runs):
     assert all(log_sd["weight"] < 0.1 and log_sd["bending"] < DOUBTFUL for _, log_sd, _, _ in runs)
 
 
+@pytest.mark.slow
 def test_the_attachments_are_found_with_the_right_sheet(runs):
     for _, _, stated, _ in runs:
         found = np.asarray(stated.probability) > 0.5
