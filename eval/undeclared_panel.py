@@ -64,37 +64,37 @@ class Row:
     """Of the noise's variance, what neighbours share."""
 
 
-def inside(effect: str, *disturbances: Disturbance) -> Row:
+def _inside(effect: str, *disturbances: Disturbance) -> Row:
     """A row of one effect that the library has."""
     return Row(effects=(effect,), disturbances=disturbances)
 
 
 INSIDE: dict[str, Row] = {
-    "gravity x 0.3": inside("gravity", Gravity(magnitude=0.3, start=LATE)),
-    "gravity leaning": inside("gravity", Gravity(magnitude=1.0, tilt_deg=25, azimuth_deg=30, start=LATE)),
-    "bed lower": inside("bed", Bed(magnitude=-0.003, start=LATE)),
-    "friction": inside("friction", Friction(magnitude=1.0)),
-    "viscous drag": inside("viscous_drag", ViscousDrag(magnitude=2.0), MOVING),
-    "material damping": inside("material_damping", MaterialDamping(magnitude=0.5), MOVING),
-    "tissue creep": inside("tissue_creep", TissueCreep(magnitude=0.3)),
-    "inclusion": inside("inclusion", Inclusion(magnitude=8, centre=(-0.02, -0.02), radius=0.015)),
-    "heterogeneity": inside("heterogeneity", Heterogeneity(magnitude=0.8)),
-    "anisotropy": inside("anisotropy", Anisotropy(magnitude=3.0)),
-    "stretch": inside("stretch", Stretch(magnitude=2.5)),
-    "bending": inside("bending", Bending(magnitude=15)),
-    "pre-strain": inside("pre_strain", PreStrain(magnitude=0.03, start=LATE)),
-    "stiffening": inside("strain_stiffening", StrainStiffening(magnitude=400)),
-    "point pull": inside("point_pull", PointPull(magnitude=3.0, at=(0.02, 0.02), start=LATE)),
-    "anchor shift": inside("anchor_shift", AnchorShift(magnitude=0.003, direction=(1.0, 0.3, 0.0), start=LATE)),
-    "anchor creep": inside("anchor_creep", AnchorCreep(magnitude=0.5)),
-    "tool scale": inside("tool_scale", ToolScale(magnitude=1.08)),
-    "tool turn": inside("tool_turn", ToolTurn(magnitude=4.0)),
-    "tool latency": inside("tool_latency", ToolLatency(magnitude=0.2), MOVING),
-    "image latency": inside("image_latency", ImageLatency(magnitude=0.2), MOVING),
-    "camera bias": inside("camera_bias", CameraBias(magnitude=0.003, pitch_deg=1.0, start=LATE)),
-    "camera drift": inside("camera_drift", CameraDrift(magnitude=0.0003, roll_deg=0.05, start=LATE)),
-    "depth scale": inside("depth_scale", DepthScale(magnitude=1.03, start=LATE)),
-    "point slip": inside("point_slip", PointSlip(magnitude=0.0002)),
+    "gravity x 0.3": _inside("gravity", Gravity(magnitude=0.3, start=LATE)),
+    "gravity leaning": _inside("gravity", Gravity(magnitude=1.0, tilt_deg=25, azimuth_deg=30, start=LATE)),
+    "bed lower": _inside("bed", Bed(magnitude=-0.003, start=LATE)),
+    "friction": _inside("friction", Friction(magnitude=1.0)),
+    "viscous drag": _inside("viscous_drag", ViscousDrag(magnitude=2.0), MOVING),
+    "material damping": _inside("material_damping", MaterialDamping(magnitude=0.5), MOVING),
+    "tissue creep": _inside("tissue_creep", TissueCreep(magnitude=0.3)),
+    "inclusion": _inside("inclusion", Inclusion(magnitude=8, centre=(-0.02, -0.02), radius=0.015)),
+    "heterogeneity": _inside("heterogeneity", Heterogeneity(magnitude=0.8)),
+    "anisotropy": _inside("anisotropy", Anisotropy(magnitude=3.0)),
+    "stretch": _inside("stretch", Stretch(magnitude=2.5)),
+    "bending": _inside("bending", Bending(magnitude=15)),
+    "pre-strain": _inside("pre_strain", PreStrain(magnitude=0.03, start=LATE)),
+    "stiffening": _inside("strain_stiffening", StrainStiffening(magnitude=400)),
+    "point pull": _inside("point_pull", PointPull(magnitude=3.0, at=(0.02, 0.02), start=LATE)),
+    "anchor shift": _inside("anchor_shift", AnchorShift(magnitude=0.003, direction=(1.0, 0.3, 0.0), start=LATE)),
+    "anchor creep": _inside("anchor_creep", AnchorCreep(magnitude=0.5)),
+    "tool scale": _inside("tool_scale", ToolScale(magnitude=1.08)),
+    "tool turn": _inside("tool_turn", ToolTurn(magnitude=4.0)),
+    "tool latency": _inside("tool_latency", ToolLatency(magnitude=0.2), MOVING),
+    "image latency": _inside("image_latency", ImageLatency(magnitude=0.2), MOVING),
+    "camera bias": _inside("camera_bias", CameraBias(magnitude=0.003, pitch_deg=1.0, start=LATE)),
+    "camera drift": _inside("camera_drift", CameraDrift(magnitude=0.0003, roll_deg=0.05, start=LATE)),
+    "depth scale": _inside("depth_scale", DepthScale(magnitude=1.03, start=LATE)),
+    "point slip": _inside("point_slip", PointSlip(magnitude=0.0002)),
 }
 """One effect of the library each."""
 

@@ -17,7 +17,7 @@ from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, Mis
 from jiggle_mj.estimator.attribution.normal_equations import less_offset, reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
-from jiggle_mj.estimator.attribution.side_by_side import side_by_side
+from jiggle_mj.estimator.attribution.side_by_side import T, side_by_side
 from jiggle_mj.estimator.effects.sheet_model import Moment
 from jiggle_mj.estimator.filters.implicit import reconsidered
 
@@ -160,13 +160,11 @@ def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
 def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metric]:
     """Every frame at a point: how misfits weigh."""
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
-    moments = _moments(problem, point, frames)
 
-    def one(k: int) -> Metric:
-        frame, moment, x = moments[k]
+    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Metric:
         return weigh(problem.sheet, theta, s, frame, moment, x, noise)
 
-    return side_by_side(one, moments)
+    return _each(problem, point, frames, one)
 
 
 def linearised(
@@ -174,21 +172,23 @@ def linearised(
 ) -> dict[int, Glance]:
     """Every frame where it was weighed: its normal equations."""
     theta, along_ = jnp.asarray(point.theta), jnp.asarray(along)
-    moments = _moments(problem, point, weights)
 
-    def one(k: int) -> Glance:
-        frame, moment, _ = moments[k]
+    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Glance:
         return glance(problem.sheet, weights[k], theta, along_, frame, moment)
 
-    return side_by_side(one, moments)
+    return _each(problem, point, weights, one)
 
 
-def _moments(
-    problem: Problem, point: Point, frames: Iterable[int]
-) -> dict[int, tuple[ClosedFrame, Moment, Float[Array, "n 3"]]]:
-    """Frames, what an effect may know of each, and their states, at a point."""
+def _each(
+    problem: Problem,
+    point: Point,
+    frames: Iterable[int],
+    of: Callable[[int, ClosedFrame, Moment, Float[Array, "n 3"]], T],
+) -> dict[int, T]:
+    """A function of each frame, of what an effect may know of it, and of its state, at a point."""
     states, history = jnp.asarray(point.states), problem.history
-    return {k: (history.frames[k].frame, history.moment(k, states), states[k]) for k in frames}
+    moments = {k: history.moment(k, states) for k in frames}
+    return side_by_side(lambda k: of(k, history.frames[k].frame, moments[k], states[k]), moments)
 
 
 def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
@@ -207,13 +207,11 @@ def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, 
 def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> float:
     """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
     total, theta = 0.0, jnp.asarray(point.theta)
-    moments = _moments(problem, point, weights)
 
-    def of(k: int) -> Misfit:
-        frame, moment, x = moments[k]
+    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Misfit:
         return misfit(problem.sheet, weights[k], theta, frame, moment, x)
 
-    every = side_by_side(of, weights)
+    every = _each(problem, point, weights, one)
     for frames in problem.by_part(weights).values():
         missed = [every[k] for k in frames]
         tool = np.array([np.asarray(one.tool)[:, None] for one in missed])

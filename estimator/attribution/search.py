@@ -13,8 +13,17 @@ import numpy as np
 from jiggle_mj.estimator.attribution.comparison import against, behind, best, not_told_from
 from jiggle_mj.estimator.attribution.fit import Fitted, fit, moved
 from jiggle_mj.estimator.attribution.problem import Problem
-from jiggle_mj.estimator.attribution.scores import bayes_factor, occam
-from jiggle_mj.estimator.attribution.trials import COMPARED, ENTER, REMAINDER, Stage, Trial, fitted_trials, judged
+from jiggle_mj.estimator.attribution.scores import bayes_factor
+from jiggle_mj.estimator.attribution.trials import (
+    COMPARED,
+    ENTER,
+    REMAINDER,
+    Stage,
+    Trial,
+    fitted_trials,
+    judged,
+    refitted,
+)
 
 MOST = 3
 """Effects that are added at most."""
@@ -72,7 +81,7 @@ def revised(problem: Problem, added: list[Added], used: set[int], say: Say) -> l
         needed = [trial for trial in trials if trial.log_bayes_factor > ENTER]
         if not needed:
             say(f"{one.trial.effect.name} dropped")
-            last = judged(problem, replace(rest[-1].trial, fitted=plain, sds=occam(problem, plain)[1]), used, say)
+            last = judged(problem, refitted(problem, rest[-1].trial, plain), used, say)
             return [replace(other, trial=_with(other.trial, last)) for other in rest]
         again = _chosen(needed, [pair for pair in one.others if pair[0] not in others])
         rest = [replace(other, trial=_with(other.trial, again.trial)) for other in rest]
@@ -159,7 +168,7 @@ def _beside(
         else:
             point = moved(problem, plain, trial.at, trial.theta)
             fitted = fit(problem, np.append(named, trial.at), point, used)
-            found = judged(problem, replace(trial, fitted=fitted, sds=occam(problem, fitted)[1]), used, say)
+            found = judged(problem, refitted(problem, trial, fitted), used, say)
         gain = bayes_factor(problem, found.fitted, plain, trial.effect.sites)[1]
         say(f"{trial.effect.name}: {gain:.1f} nat beside the others")
         trials.append(replace(found, log_bayes_factor=gain))

@@ -112,6 +112,11 @@ def judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str], 
     return found
 
 
+def refitted(problem: Problem, trial: Trial, fitted: Fitted) -> Trial:
+    """The same effect by another fit; what that leaves and foretells is not known yet."""
+    return replace(trial, fitted=fitted, sds=occam(problem, fitted)[1], left=None, folds=None)
+
+
 def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial], used: set[int]) -> Trial:
     effect = problem.sheet.effect(score.name)
     at = problem.sheet.place(effect.name, score.site)
