@@ -60,6 +60,11 @@ def story(found: Mapping[str, Any]) -> list[str]:
             f"There are no still frames: noise of {1e3 * found['noise']['sd_m']:.2g} mm, and as much that neighbours "
             "share, was assumed."
         )
+    if left_out := found["frames"]["left_out"]:
+        told.append(
+            f"{len(left_out)} frames of {len(left_out) + found['frames']['used']} are left out: what is held is seen "
+            "there in another shape than when the jaws closed on it, so that they are not followed right."
+        )
     return told
 
 

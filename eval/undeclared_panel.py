@@ -5,8 +5,10 @@ noise half of which neighbours share. What would belong to the rest shape if it 
 the still frames.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
+import numpy as np
 from jiggle_mj.scenes import Scene, load_scene
 from jiggle_mj.scenes.anchor_disturbances import (
     AnchorBreak,
@@ -62,38 +64,51 @@ class Row:
     """Edge length of the reference's mesh [m]; particles are its vertices, points are as many whatever it is."""
     smooth_share: float = 0.5
     """Of the noise's variance, what neighbours share."""
+    sizes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """True sizes of its effects, their first parameters, where they have some."""
 
 
-def _inside(effect: str, *disturbances: Disturbance) -> Row:
+def _inside(effect: str, *disturbances: Disturbance, size: tuple[float, ...] = ()) -> Row:
     """A row of one effect that the library has."""
-    return Row(effects=(effect,), disturbances=disturbances)
+    return Row(effects=(effect,), disturbances=disturbances, sizes={effect: size} if size else {})
 
+
+LEAN, TOWARDS, TURN = np.radians(25), np.radians(30), np.radians(4)
+"""Of the gravity that leans, from the vertical and round it; of the tool's way [rad]."""
+LEANING = (np.sin(LEAN) * np.cos(TOWARDS), np.sin(LEAN) * np.sin(TOWARDS), 1 - np.cos(LEAN))
+BITE = 0.003 * np.array([1.0, 0.3, 0.0]) / np.hypot(1.0, 0.3)
+"""By which the anchors are shifted [m]."""
 
 INSIDE: dict[str, Row] = {
-    "gravity x 0.3": _inside("gravity", Gravity(magnitude=0.3, start=LATE)),
-    "gravity leaning": _inside("gravity", Gravity(magnitude=1.0, tilt_deg=25, azimuth_deg=30, start=LATE)),
-    "bed lower": _inside("bed", Bed(magnitude=-0.003, start=LATE)),
+    "gravity x 0.3": _inside("gravity", Gravity(magnitude=0.3, start=LATE), size=(0.0, 0.0, 0.7)),
+    "gravity leaning": _inside(
+        "gravity", Gravity(magnitude=1.0, tilt_deg=25, azimuth_deg=30, start=LATE), size=LEANING
+    ),
+    "bed lower": _inside("bed", Bed(magnitude=-0.003, start=LATE), size=(-0.003, 0.0, 0.0)),
+    # no size: contacts creep, and carry 0.25 to 0.53 of their load along the bed by the time a frame is taken
     "friction": _inside("friction", Friction(magnitude=1.0)),
     "viscous drag": _inside("viscous_drag", ViscousDrag(magnitude=2.0), MOVING),
-    "material damping": _inside("material_damping", MaterialDamping(magnitude=0.5), MOVING),
-    "tissue creep": _inside("tissue_creep", TissueCreep(magnitude=0.3)),
+    "material damping": _inside("material_damping", MaterialDamping(magnitude=0.5), MOVING, size=(0.5,)),
+    "tissue creep": _inside("tissue_creep", TissueCreep(magnitude=0.3), size=(0.3,)),
     "inclusion": _inside("inclusion", Inclusion(magnitude=8, centre=(-0.02, -0.02), radius=0.015)),
     "heterogeneity": _inside("heterogeneity", Heterogeneity(magnitude=0.8)),
-    "anisotropy": _inside("anisotropy", Anisotropy(magnitude=3.0)),
-    "stretch": _inside("stretch", Stretch(magnitude=2.5)),
-    "bending": _inside("bending", Bending(magnitude=15)),
-    "pre-strain": _inside("pre_strain", PreStrain(magnitude=0.03, start=LATE)),
-    "stiffening": _inside("strain_stiffening", StrainStiffening(magnitude=400)),
+    "anisotropy": _inside("anisotropy", Anisotropy(magnitude=3.0), size=(3.0,)),
+    "stretch": _inside("stretch", Stretch(magnitude=2.5), size=(np.log(2.5),)),
+    "bending": _inside("bending", Bending(magnitude=15), size=(np.log(15),)),
+    "pre-strain": _inside("pre_strain", PreStrain(magnitude=0.03, start=LATE), size=(0.03, 0.03, 0.0)),
+    "stiffening": _inside("strain_stiffening", StrainStiffening(magnitude=400), size=(400.0,)),
     "point pull": _inside("point_pull", PointPull(magnitude=3.0, at=(0.02, 0.02), start=LATE)),
-    "anchor shift": _inside("anchor_shift", AnchorShift(magnitude=0.003, direction=(1.0, 0.3, 0.0), start=LATE)),
-    "anchor creep": _inside("anchor_creep", AnchorCreep(magnitude=0.5)),
-    "tool scale": _inside("tool_scale", ToolScale(magnitude=1.08)),
-    "tool turn": _inside("tool_turn", ToolTurn(magnitude=4.0)),
-    "tool latency": _inside("tool_latency", ToolLatency(magnitude=0.2), MOVING),
-    "image latency": _inside("image_latency", ImageLatency(magnitude=0.2), MOVING),
+    "anchor shift": _inside(
+        "anchor_shift", AnchorShift(magnitude=0.003, direction=(1.0, 0.3, 0.0), start=LATE), size=tuple(BITE)
+    ),
+    "anchor creep": _inside("anchor_creep", AnchorCreep(magnitude=0.5), size=(0.5,)),
+    "tool scale": _inside("tool_scale", ToolScale(magnitude=1.08), size=(-np.log(1.08),)),
+    "tool turn": _inside("tool_turn", ToolTurn(magnitude=4.0), size=(0.0, -TURN, 0.0)),
+    "tool latency": _inside("tool_latency", ToolLatency(magnitude=0.2), MOVING, size=(0.2,)),
+    "image latency": _inside("image_latency", ImageLatency(magnitude=0.2), MOVING, size=(0.2,)),
     "camera bias": _inside("camera_bias", CameraBias(magnitude=0.003, pitch_deg=1.0, start=LATE)),
     "camera drift": _inside("camera_drift", CameraDrift(magnitude=0.0003, roll_deg=0.05, start=LATE)),
-    "depth scale": _inside("depth_scale", DepthScale(magnitude=1.03, start=LATE)),
+    "depth scale": _inside("depth_scale", DepthScale(magnitude=1.03, start=LATE), size=(np.log(1.03),)),
     "point slip": _inside("point_slip", PointSlip(magnitude=0.0002)),
 }
 """One effect of the library each."""
@@ -104,6 +119,7 @@ def _together(*names: str) -> Row:
     return Row(
         effects=tuple(effect for row in rows for effect in row.effects),
         disturbances=tuple(sorted((one for row in rows for one in row.disturbances), key=lambda one: one.start)),
+        sizes={name: size for row in rows for name, size in row.sizes.items()},
     )
 
 

@@ -14,6 +14,7 @@ from jiggle_mj.eval.closing_the_loop import DISCREPANCY, close_loop
 from jiggle_mj.eval.tables import carry_out
 from jiggle_mj.eval.undeclared_panel import IMAGES, INSIDE, NOTHING, OUTSIDE, ROWS, TOGETHER, Row, scene_with
 from jiggle_mj.scenes import Reference, programme
+from scipy.stats import norm
 
 from jiggle_mj.episode import observe
 from jiggle_mj.mcap_files import truth_path
@@ -89,7 +90,7 @@ def _sums(runs: Found) -> list[str]:
     said = []
     for what, rows in (("One effect", INSIDE), ("Two effects", TOGETHER), ("One effect, from images", IMAGES)):
         if mine := [(ROWS[name], found) for (name, _), found in runs.items() if name in rows]:
-            said.append(f"{what}: {_right(mine)}; {_gained([found for _, found in mine])}.")
+            said.append(f"{what}: {_right(mine)}; {_gained([found for _, found in mine])}; {_covered(mine)}.")
     if nothing := [found for (name, _), found in runs.items() if name in NOTHING]:
         said.append(f"Nothing undeclared: {sum(bool(one['effects']) for one in nothing)} of {len(nothing)} named.")
     if outside := [found for (name, _), found in runs.items() if name in OUTSIDE]:
@@ -104,6 +105,17 @@ def _right(runs: list[tuple[Row, dict[str, Any]]]) -> str:
     first = sum(found["effects"][:1] != [] and found["effects"][0]["name"] in row.effects for row, found in runs)
     among = sum(set(named(found)) >= set(row.effects) for row, found in runs)
     return f"named first in {first} of {len(runs)}, all added in {added}, all among those named in {among}"
+
+
+def _covered(runs: list[tuple[Row, dict[str, Any]]]) -> str:
+    """How many parameters of effects that were added lie within 95 % intervals, of those with a true value."""
+    within = [
+        abs(theta - true) <= norm.ppf(0.975) * sd
+        for row, found in runs
+        for one in found["effects"]
+        for theta, sd, true in zip(one["theta"], one["sd"], row.sizes.get(one["name"], ()), strict=False)
+    ]
+    return f"{sum(within)} of {len(within)} parameters within their 95 % interval"
 
 
 def _gained(runs: list[dict[str, Any]]) -> str:

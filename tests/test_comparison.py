@@ -9,7 +9,7 @@ from jiggle_mj.estimator.attribution.comparison import against, behind, best, no
 from jiggle_mj.estimator.attribution.held_out import Foretold
 from jiggle_mj.estimator.attribution.leftover import Leftover
 from jiggle_mj.estimator.attribution.problem import Problem
-from jiggle_mj.estimator.attribution.trials import Stage, Trial
+from jiggle_mj.estimator.attribution.trials import Stage, Trial, stated_sd
 from jiggle_mj.estimator.effects import LIBRARY
 
 EFFECTS = {one.name: one for one in LIBRARY}
@@ -118,3 +118,22 @@ def test_each_but_the_last_is_compared_again_with_what_was_tried_in_its_place(mo
     assert asked == [["gravity", "stretch"], ["tool_scale"]]
     assert [one.trial.effect.name for one in found] == ["stretch", "tool_scale", "friction"]
     assert [one.effect.name for one in found[0].rivals] == ["gravity"]
+
+
+@pytest.mark.parametrize(("second_mm", "added"), [(0.4, ["gravity", "tool_scale"]), (0.55, [])])
+def test_of_two_that_are_added_together_the_second_foretells_better_than_the_first_alone(monkeypatch, second_mm, added):
+    first, second = trial("gravity", 300.0, 0.5, 0.5), trial("tool_scale", 200.0, second_mm, second_mm)
+    monkeypatch.setattr(search, "fitted_trials", lambda *_: [second])
+    monkeypatch.setattr(search, "judged", lambda problem, one, used, say: one)
+    monkeypatch.setattr(search, "replace", lambda one, **changed: one)
+    monkeypatch.setattr(search, "Stage", lambda **said: stage(0.5, 0.5))
+    before = stage(1.0, 1.0, left=100.0)
+    found = search._two(object.__new__(Problem), before, [], [first], 0.0, set(), lambda said: None)
+    assert [one.trial.effect.name for one in found] == added
+
+
+def test_a_size_is_as_sure_as_one_part_alone_makes_it_and_as_what_any_sheet_has():
+    problem, one = object.__new__(Problem), trial("bed", 300.0, 0.5, 0.5, 0.5, 0.5)
+    vars(problem).update(own=np.array([1, 7]), own_sd=np.array([0.3, 9.0]))
+    vars(one).update(fitted=SimpleNamespace(named=np.array([0, 1, 2, 5])), sds=np.array([0.1, 0.2, 0.3, 0.4]))
+    np.testing.assert_allclose(stated_sd(problem, one), [0.2, 0.5, 0.6])

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import get_args
 
@@ -16,12 +17,19 @@ from jiggle_mj.cli import RowsName
 from jiggle_mj.recording_declaration import VERSION, file_metadata
 
 
-def found(verdict: str, *names: str, after: float = 1e-3, also: tuple[str, ...] = ()) -> dict:
+def found(
+    verdict: str,
+    *names: str,
+    after: float = 1e-3,
+    also: tuple[str, ...] = (),
+    theta: Sequence[float] = (0.1, 0.2),
+    sd: Sequence[float] = (0.01, 0.02),
+) -> dict:
     """A run that was foretold to 2 mm before."""
     detection = {"by_dilation": {"1": {"pug": 0.5}}}
     return {
         "verdict": verdict,
-        "effects": [{"name": name, "theta": [0.1, 0.2], "sd": [0.01, 0.02]} for name in names],
+        "effects": [{"name": name, "theta": theta, "sd": sd} for name in names],
         "ambiguous_with": list(also),
         "held_out": {"before_rms_m": 2e-3, "after_rms_m": after},
         "detection_before": detection,
@@ -47,6 +55,13 @@ def test_what_is_inside_is_in_the_library_and_what_is_outside_is_not():
     names = {effect.name for effect in LIBRARY}
     assert {effect for row in ROWS.values() for effect in row.effects} <= names
     assert not {type(one).__name__.lower() for row in OUTSIDE.values() for one in row.disturbances} & names
+
+
+def test_true_sizes_are_of_the_row_s_own_effects_and_as_long_at_most():
+    lengths = {effect.name: len(effect.prior_sd) for effect in LIBRARY}
+    for row in ROWS.values():
+        assert set(row.sizes) <= set(row.effects)
+        assert all(len(size) <= lengths[name] for name, size in row.sizes.items())
 
 
 def test_two_effects_are_each_of_another_name_and_begin_in_turn():
@@ -81,14 +96,24 @@ def test_counts():
     )
     assert lines[-5:] == [
         "One effect: named first in 1 of 3, all added in 1, all among those named in 2; held-out error falls by 50% at "
-        "the median, and rises in 0.",
+        "the median, and rises in 0; 0 of 0 parameters within their 95 % interval.",
         "Two effects: named first in 3 of 3, all added in 1, all among those named in 2; held-out error falls by 50% "
-        "at the median, and rises in 1.",
+        "at the median, and rises in 1; 0 of 4 parameters within their 95 % interval.",
         "One effect, from images: named first in 1 of 1, all added in 1, all among those named in 1; held-out error "
-        "falls by 75% at the median, and rises in 0.",
+        "falls by 75% at the median, and rises in 0; 0 of 1 parameters within their 95 % interval.",
         "Nothing undeclared: 1 of 2 named.",
         "Not in the library: 1 of 2 unexplained or with a remainder.",
     ]
+
+
+def test_sizes_lie_within_their_intervals_or_do_not():
+    """Of two lifts of a lowered bed: two of three parameters, and one of three; friction has no true size."""
+    runs = {
+        ("bed lower", 0): found("effect", "bed", theta=[-0.0031, 0.001, 0.003], sd=[1e-4, 1e-3, 1e-3]),
+        ("bed lower", 1): found("effect", "bed", theta=[-0.0033, 0.003, 0.0], sd=[1e-4, 1e-3, 1e-3]),
+        ("friction", 0): found("effect", "friction", theta=[0.4], sd=[0.01]),
+    }
+    assert markdown(runs).endswith("3 of 6 parameters within their 95 % interval.")
 
 
 @pytest.mark.parametrize(("version", "times"), [(file_metadata()[VERSION], 1), ("0.0", 2)])

@@ -5,6 +5,8 @@
 
 In the robot's base frame, metres and seconds by the messages' own stamps. The camera's place is the calibration's last
 line. A grid's rows and columns are turned so that x rises along a row and y falls, which is how the authors read it.
+The camera lays the grid on the cloth anew in each run, with its rows up to 30 mm further along the bar: what is written
+is how far each point has gone since the run's still frames, from where the first run's still frames have it.
 """
 
 import argparse
@@ -16,6 +18,8 @@ from scipy.spatial.transform import Rotation
 
 STAMP, SIZE, FIRST, POSE = 2, 4, 5, slice(4, 11)
 """Columns: time of the message, points along a side, first of all x; position and quaternion, w last."""
+STILL = 1.8
+"""How long the arm stands at the start of every run [s]."""
 
 
 def table(path: Path) -> list[list[str]]:
@@ -35,7 +39,7 @@ def main() -> None:
     seen_by = Rotation.from_quat(camera[3:])
     points, times, runs, tool, tool_times, turns = [], [], [], [], [], []
     paths = sorted(said.folder.glob(f"{said.grid}_traj*_mesh.csv"), key=lambda path: int(table(path)[0][STAMP]))
-    origin = None
+    origin = rest = None
     for run, path in enumerate(paths):
         frames, poses = table(path), table(path.with_name(path.name.replace("mesh", "tcp")))
         stamps = np.array([int(row[STAMP]) for row in frames])
@@ -43,7 +47,10 @@ def main() -> None:
         n = int(frames[0][SIZE])
         given = np.array([[float(one) if one else np.nan for one in row[FIRST : FIRST + 3 * n * n]] for row in frames])
         grid = given.reshape(len(frames), 3, n, n).transpose(0, 3, 2, 1)
-        points.append(seen_by.apply(grid.reshape(-1, 3)).reshape(len(frames), n * n, 3) + camera[:3])
+        seen = seen_by.apply(grid.reshape(-1, 3)).reshape(len(frames), n * n, 3) + camera[:3]
+        began = np.nanmean(seen[stamps - stamps[0] < STILL * 1e9], axis=0)
+        rest = began if run == 0 else rest
+        points.append(rest + seen - began)
         times.append((stamps - origin) / 1e9)
         runs.append(np.full(len(frames), run))
         at, first = np.unique([int(row[STAMP]) for row in poses], return_index=True)

@@ -64,6 +64,8 @@ def close_the_loop(
     parts = list(dict.fromkeys(one.part for one in gathered.frames))
     spare = parts[-1] if len(parts) > 1 else None
     used = set(parts) - {spare}
+    if gathered.left_out:
+        say(f"{len(gathered.left_out)} frames left out: what is held is seen in another shape there")
     say(f"fitting {len(problem.frames(used))} frames in {len(used)} parts with what is declared")
     stages, added, refused = [_declared(problem, gathered, used, say)], list[Added](), Refused()
     while len(added) < MOST:

@@ -8,7 +8,7 @@ from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold
 from jiggle_mj.estimator.attribution.localisation import localisation
 from jiggle_mj.estimator.attribution.suggestion import Suggestion
-from jiggle_mj.estimator.attribution.trials import Trial
+from jiggle_mj.estimator.attribution.trials import Trial, stated_sd
 
 
 def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | None = None) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | Non
     noise, before = gathered.noise, localisation(closed.problem, first.fitted)
     return {
         "verdict": closed.verdict,
-        "effects": [_effect(*each) for each in zip(closed.accepted, closed.rivals, strict=True)],
+        "effects": [_effect(closed, *each) for each in zip(closed.accepted, closed.rivals, strict=True)],
         "ambiguous_with": list(dict.fromkeys(one.effect.name for rivals in closed.rivals for one in rivals)),
         "refused": [{"name": one.effect.name, "why": why} for one, why in closed.refused],
         "tested": [effect.name for effect in closed.problem.sheet.library],
@@ -53,6 +53,7 @@ def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | Non
             "smooth_length_m": noise.length,
             "still_frames": noise.frames,
         },
+        "frames": {"used": len(gathered.frames), "left_out": list(gathered.left_out)},
         "localisation": before,
         "localisation_after": before if closed.final is first.fitted else localisation(closed.problem, closed.final),
         "suggestion": None if suggestion is None else _suggestion(suggestion),
@@ -61,12 +62,12 @@ def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | Non
     }
 
 
-def _effect(one: Trial, rivals: list[Trial]) -> dict[str, Any]:
+def _effect(closed: Closed, one: Trial, rivals: list[Trial]) -> dict[str, Any]:
     return {
         "name": one.effect.name,
         "site": one.score.site if one.effect.sites > 1 else None,
         "theta": one.theta.tolist(),
-        "sd": one.sd.tolist(),
+        "sd": stated_sd(closed.problem, one).tolist(),
         "units": list(one.effect.units),
         "log_bayes_factor": one.log_bayes_factor,
         "p_value": one.score.p_value,

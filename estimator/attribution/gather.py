@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, Timed
+from jiggle_mj.estimator.attribution.held_shape import another_shape
 from jiggle_mj.estimator.attribution.still_noise import StillNoise, measure
 from jiggle_mj.estimator.config import EstimatorConfig
 from jiggle_mj.estimator.estimator import Estimator
@@ -37,6 +38,8 @@ class Gathered:
     """Of the noise's smooth part; the frames' precisions hold the rest [m]."""
     detection: Detection
     """With nothing but what is declared."""
+    left_out: tuple[int, ...]
+    """Indices of frames in which what is held is seen in another shape than when the jaws closed on it."""
 
 
 def gather(
@@ -78,12 +81,14 @@ def gather(
     estimator.release()
     noise = _noise_of([still], estimator) or _noise_of(list(standing.values()), estimator) or assumed(stated)
     fields, sd = noise.fields(estimator.sheet.rest)
+    mistaken = another_shape(frames, sd, fields)
     return Gathered(
         estimator=estimator,
-        frames=_parted([_weighed(one, sd, fields) for one in frames]),
+        frames=_parted([_weighed(one, sd, fields) for k, one in enumerate(frames) if k not in mistaken]),
         noise=noise,
         fields=fields,
         detection=estimator.detection,
+        left_out=tuple(frames[k].index for k in mistaken),
     )
 
 

@@ -16,7 +16,13 @@ from jiggle_mj.estimator.filters.build import force_balance
 from jiggle_mj.estimator.filters.implicit import prior_belief
 from jiggle_mj.estimator.mesh import SheetMesh
 
-OWN = {"stretch": (0.05,), "bending": (0.3,), "friction": (0.05,), "material_damping": (0.03,)}
+OWN = {
+    "stretch": (0.05,),
+    "bending": (0.3,),
+    "friction": (0.05,),
+    "material_damping": (0.03,),
+    "image_latency": (0.02,),
+}
 """What may be a little off in any sheet, and is no effect: standard deviations in the effects' units."""
 FORCE_VARIANCE = 0.04
 """Share of the filter's force variance that is left when what is the same in all frames of a grasp goes to smooth force

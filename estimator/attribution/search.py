@@ -126,7 +126,7 @@ def _two(
     used: set[int],
     say: Say,
 ) -> list[Added]:
-    """The likeliest of some effects with another beside it, if together they are better than a yardstick."""
+    """The likeliest of some effects with another beside it, if both are better than a yardstick and than it alone."""
     firsts = [one for one in firsts if one.sensible]
     if not firsts or len(before) + 2 > MOST:
         return []
@@ -137,6 +137,7 @@ def _two(
     )
     accepted = [*(other.trial for other in before), first]
     passed, _ = _tried(problem, one.stage, yardstick, accepted, used, say, first.log_bayes_factor + head_start)
+    passed = [two for two in passed if against(two, one.stage) is None]
     return [one, _chosen(passed, [])] if passed else []
 
 

@@ -112,6 +112,17 @@ def judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str], 
     return found
 
 
+def stated_sd(problem: Problem, trial: Trial) -> np.ndarray:
+    """What is said of how well an effect's size is known, by its standard deviation.
+
+    The model errs in part alike in all grasps, which no number of them averages away: as one of them would tell it. And
+    what any sheet has of it by itself may be of either sign.
+    """
+    own = dict(zip(problem.own.tolist(), problem.own_sd.tolist(), strict=True))
+    alone = np.sqrt(max(len(trial.folds or []), 1)) * trial.sd
+    return np.hypot(alone, [own.get(k, 0.0) for k in trial.at.tolist()])
+
+
 def refitted(problem: Problem, trial: Trial, fitted: Fitted) -> Trial:
     """The same effect by another fit; what that leaves and foretells is not known yet."""
     return replace(trial, fitted=fitted, sds=occam(problem, fitted)[1], left=None, folds=None)
