@@ -13,7 +13,7 @@ from jiggle_mj.eval.closing_the_loop import DISCREPANCY
 from jiggle_mj.eval.undeclared_panel import GROUPS, MOVING, OUTSIDE, ROWS, TOGETHER, scene_with
 from jiggle_mj.eval.undeclared_table import markdown, measure
 
-from jiggle_mj.cli import RowsName
+from jiggle_mj.cli.options import RowsName
 from jiggle_mj.recording_declaration import VERSION, file_metadata
 
 

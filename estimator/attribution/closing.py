@@ -67,12 +67,13 @@ def close_the_loop(
     if gathered.left_out:
         say(f"{len(gathered.left_out)} frames left out: what is held is seen in another shape there")
     say(f"fitting {len(problem.frames(used))} frames in {len(used)} parts with what is declared")
-    stages, added, refused = [_declared(problem, gathered, used, say)], list[Added](), Refused()
+    stages, added, refused, at_last = [_declared(problem, gathered, used, say)], list[Added](), Refused(), Refused()
     while len(added) < MOST:
         found, more = following(problem, stages[-1], added, used, say)
-        refused += more
         if found is added:
+            at_last = more
             break
+        refused += more
         added = found
         stages.append(added[-1].stage)
         say(f"added by now: {', '.join(one.trial.effect.name for one in added)}")
@@ -81,7 +82,7 @@ def close_the_loop(
         stages.append(added[-1].stage)
     accepted, names = [one.trial for one in added], {one.trial.effect.name for one in added}
     rivals = [[one for one in group.rivals if one.effect.name not in names] for group in added]
-    refused += [pair for group in added for pair in group.others]
+    refused += [pair for group in added for pair in group.others] + at_last
     last_said = {one.effect.name: (one, why) for one, why in refused}
     named = names | {one.effect.name for group in rivals for one in group}
     reported = None

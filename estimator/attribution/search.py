@@ -52,15 +52,15 @@ class Added:
 def following(
     problem: Problem, stage: Stage, added: list[Added], used: set[int], say: Say
 ) -> tuple[list[Added], Refused]:
-    """What there is in the model after a stage, and what is refused; nothing new where nothing helps.
+    """What there is in the model after a stage, and what is refused by itself; nothing new where nothing helps.
 
-    An effect; or two, where much is left over, none helps by itself, and another does beside one that was refused here,
-    or in the place of the last.
+    An effect, which knows itself what was refused in its place; or two, where much is left over, none helps by itself,
+    and another does beside one that was refused here, or in the place of the last.
     """
     accepted = [one.trial for one in added]
     passed, refused = _tried(problem, stage, stage, accepted, used, say)
     if passed:
-        return [*added, _chosen(passed, refused)], refused
+        return [*added, _chosen(passed, refused)], []
     if stage.left.gain > REMAINDER:
         starts = [(added, [one for one, _ in refused], 0.0)]
         starts += [(added[:-1], _else(added[-1]), -accepted[-1].log_bayes_factor)] if added else []

@@ -1,0 +1,16 @@
+"""Options that several verbs have, as tyro reads them."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Sensing = Literal["stereo", "points", "particles", "cloud"]
+FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
+PathArgument = Annotated[Path, tyro.conf.Positional]
+Name = Annotated[str, tyro.conf.Positional]
+RowsName = Literal["inside", "together", "images", "outside", "nothing"]
+TableName = Literal["main", "active", "acts", "undeclared", "scalability", "simulation", "one-lift"]
+Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+AsJson = Annotated[bool, tyro.conf.arg(name="json")]
+Disturb = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[=MAGNITUDE]")]]
