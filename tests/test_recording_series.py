@@ -375,7 +375,9 @@ def test_ctrl_c_leaves_whole_recordings_and_says_how_to_go_on(one_by_one, tmp_pa
     out = tmp_path / "out"
     command = [sys.executable, "-m", "jiggle_mj", "record", str(write_scene(tmp_path)), "--out", str(out)]
     command += ["--sensing", "particles", "--count", "1000", "--jobs", "2"]
+    heard = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs inherit deaf ears
     running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, heard)
     until(lambda: (out / "000001.mcap").exists())
     children = Path(f"/proc/{running.pid}/task").glob("*/children")
     workers = " ".join(path.read_text() for path in children).split()
