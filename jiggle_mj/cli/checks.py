@@ -10,7 +10,7 @@ import tyro
 from rich.table import Table
 
 from jiggle_mj.cli.options import AsJson, Disturb, Name
-from jiggle_mj.cli.terminal import console
+from jiggle_mj.cli.terminal import console, say
 
 
 def bench(
@@ -31,9 +31,6 @@ def bench(
         as_json: print the figures to stdout.
     """
     from jiggle_mj.eval.benchmark import SIZES, baseline, benchmark, regressions
-
-    def say(text: str) -> None:
-        console.print(text, highlight=False)
 
     if part == "reference":
         from jiggle_mj.eval import reference_benchmark as reference

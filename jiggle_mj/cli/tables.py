@@ -5,7 +5,7 @@ from typing import Annotated
 import tyro
 
 from jiggle_mj.cli.options import Out, RowsName, Sensing, TableName
-from jiggle_mj.cli.terminal import console
+from jiggle_mj.cli.terminal import console, say
 from jiggle_mj.errors import OptionError
 
 
@@ -35,9 +35,6 @@ def table(
             nothing; all if left out.
     """
     from jiggle_mj.eval import paper_tables, tables
-
-    def say(text: str) -> None:
-        console.print(text, highlight=False)
 
     if sensing is not None and name != "active":
         raise OptionError(f"--sensing is for the table active; got {name}.")

@@ -19,6 +19,11 @@ if TYPE_CHECKING:
 console = Console(stderr=True)
 
 
+def say(text: str) -> None:
+    """A line about long work."""
+    console.print(text, highlight=False)
+
+
 def stop(failure: object, code: int) -> NoReturn:
     """Say why in red, and leave."""
     console.print(f"jiggle-mj: {failure}", style="red", markup=False, highlight=False, soft_wrap=True)
