@@ -73,12 +73,14 @@ class History:
         twice = follows[k] and follows[k - 1]
         times, ways = self._reports[one.grasp]
         before = states[k - 1] if follows[k] else one.state
+        gap = self._times[k] - self._times[k - 1] if follows[k] else USUAL_GAP
+        earlier_gap = self._times[k - 1] - self._times[k - 2] if twice else USUAL_GAP
         return Moment(
             rest=self.rest,
-            time=jnp.asarray(one.time),
-            gap=jnp.asarray(self._times[k] - self._times[k - 1] if follows[k] else USUAL_GAP),
-            earlier_gap=jnp.asarray(self._times[k - 1] - self._times[k - 2] if twice else USUAL_GAP),
-            closed=jnp.asarray(one.closed),
+            time=jnp.asarray(one.time, dtype=float),  # said, so that all moments are compiled for as one
+            gap=jnp.asarray(gap, dtype=float),
+            earlier_gap=jnp.asarray(earlier_gap, dtype=float),
+            closed=jnp.asarray(one.closed, dtype=float),
             now=jnp.asarray(states[k]),
             before=jnp.asarray(before),
             earlier=jnp.asarray(states[k - 2] if twice else before),
