@@ -6,6 +6,7 @@ from typing import Literal, get_args
 from jiggle_mj.estimator.surrogate import Membrane
 
 FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
+Judging = Literal["grasps", "frames", "end"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,9 +35,10 @@ class EstimatorConfig:
     """How well held particles follow the tip [m]."""
     grip_stiffness: float = 3.0
     """Of the springs that carry held particles with the tip while the state is searched [k]."""
-    acting: bool = False
-    """Whether a policy waits for the belief: after each frame a few samples say where the implicit filter's belief is,
-    a second or two instead of a sweep's milliseconds, and noise and belief are judged thoroughly at the end alone."""
+    judging: Judging = "grasps"
+    """When the implicit filter judges noise and belief thoroughly: whenever the jaws open, or at the end alone. For
+    a policy, which waits for the belief: at the end, and by a few samples after each of the frames, which takes a
+    second or two instead of a sweep's milliseconds."""
     detect_above: float = 0.011
     """Filters that state no probability report a particle attached when its mean stiffness exceeds this [k]."""
 
@@ -54,6 +56,8 @@ class EstimatorConfig:
                 )
         if self.filter not in get_args(FilterName):
             raise ValueError(f"EstimatorConfig.filter must be one of {get_args(FilterName)}; got {self.filter!r}.")
+        if self.judging not in get_args(Judging):
+            raise ValueError(f"EstimatorConfig.judging must be one of {get_args(Judging)}; got {self.judging!r}.")
         if not (isinstance(self.samples, int) and self.samples >= 1):
             raise ValueError(f"EstimatorConfig.samples must be an integer of at least 1; got {self.samples}.")
         if self.membrane not in ("triangles", "edges"):

@@ -282,12 +282,12 @@ class Estimator:
             self._change(event, observation.index)
         assert self._filter is not None
         if not tool.closed:
-            self._release(thorough=not self.config.acting)
+            self._release(thorough=self.config.judging == "grasps")
             self._hold = self._closing = None
             self._idle = observation
             return None
         if self._closing is None or self._closing.grasp != tool.grasp:
-            self._release(thorough=not self.config.acting)
+            self._release(thorough=self.config.judging == "grasps")
             self._closing = tool
         began = time.perf_counter()
         track = self._see(observation)
@@ -303,7 +303,8 @@ class Estimator:
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
             )
         self._hold, self._x = hold, np.asarray(update.x)
-        stated = (self._filter.reconsider(update.belief) if self.config.acting else None) or update
+        again = self._filter.reconsider(update.belief) if self.config.judging == "frames" else None
+        stated = again or update
         self._believe(stated)
         return Estimate(
             index=observation.index,
@@ -328,7 +329,7 @@ class Estimator:
         if not region.any():
             self.skipped.append((index, f"the {type(event).__name__.lower()} is beside the sheet, and was left out"))
             return
-        self._release(thorough=not self.config.acting)
+        self._release(thorough=self.config.judging == "grasps")
         assert self._filter is not None
         if isinstance(self._belief, AttachmentBelief) and isinstance(self._filter, ImplicitFilter):
             if self.changes:

@@ -85,7 +85,7 @@ def measure(
     """
     names = {(scene, policy, seed): f"{scene}-{policy}-{sensing}-{seed}"
              for scene, policy, seed in product(scenes, policies, seeds)}  # fmt: skip
-    config = replace(EstimatorConfig(), acting=True)
+    config = replace(EstimatorConfig(), judging="frames")
     left = {
         name: partial(_run, scene, policy, seed, directory / name, sensing)
         for (scene, policy, seed), name in names.items()

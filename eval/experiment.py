@@ -87,7 +87,7 @@ def run_scene(
     policy = policy or scene.programme.policy
     chooses, config = policy_named(policy, scene, seed=seed), config or EstimatorConfig()
     if chooses is not None:
-        config = replace(config, acting=True)
+        config = replace(config, judging="frames")
         check_goes_with(chooses, config)
     own = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
     check_directory(directory, own, overwrite=overwrite)

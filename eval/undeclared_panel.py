@@ -18,6 +18,7 @@ from jiggle_mj.scenes.anchor_disturbances import (
     GraspSlip,
     PointPull,
 )
+from jiggle_mj.scenes.attachments import Attachment
 from jiggle_mj.scenes.disturbance import Disturbance
 from jiggle_mj.scenes.observer import Sensing
 from jiggle_mj.scenes.report_disturbances import (
@@ -59,6 +60,8 @@ class Row:
     disturbances: tuple[Disturbance, ...] = ()
     effects: tuple[str, ...] = ()
     """Their names in the library; none where it has none, or where there is nothing to name."""
+    layout: str = "arc"
+    """The shipped scene whose attachments it has."""
     sensing: Sensing = "particles"
     spacing: float = 6.5e-3
     """Edge length of the reference's mesh [m]; particles are its vertices, points are as many whatever it is."""
@@ -153,6 +156,9 @@ NOTHING: dict[str, Row] = {
     "nothing, shared noise": Row(smooth_share=0.8),
     "nothing, finer reference": Row(sensing="points", spacing=3.25e-3),
     "nothing, images": Row(sensing="stereo"),
+    "nothing, U shape": Row(layout="u_shape"),
+    "nothing, arc and line": Row(layout="arc_line"),
+    "nothing, disc": Row(layout="large_attach"),
 }
 """Nothing that is undeclared: what is named there is a false alarm."""
 GROUPS = {"inside": INSIDE, "together": TOGETHER, "images": IMAGES, "outside": OUTSIDE, "nothing": NOTHING}
@@ -162,8 +168,9 @@ NOISE = 1.5e-4 * 2**0.5
 
 
 def scene_with(name: str, seed: int) -> Scene:
-    """The arc on a coarser sheet, with more grasps, shared noise, and what the row of this name holds."""
-    arc, row = load_scene("arc"), ROWS[name]
+    """A shipped scene on a coarser sheet, with more grasps, shared noise, and what the row of this name holds."""
+    row = ROWS[name]
+    arc, layout = load_scene("arc"), load_scene(row.layout)
     pulls = replace(
         arc.programme,
         still_frames=20,
@@ -186,9 +193,14 @@ def scene_with(name: str, seed: int) -> Scene:
         secret=True,
         tissue=replace(arc.tissue, spacing=row.spacing, mesh="unstructured", seed=seed),
         bed=replace(arc.bed, friction=0.1),
-        attachments=(replace(arc.attachments[0], width=0.0115, stiffness=2.0),),
+        attachments=tuple(_coarser(one) for one in layout.attachments),
         tweezer=replace(arc.tweezer, radius=8e-3, speed=SLOW if MOVING in row.disturbances else arc.tweezer.speed),
         programme=pulls,
         sensing=noise,
         disturbances=row.disturbances,
     )
+
+
+def _coarser(one: Attachment) -> Attachment:
+    """The same attachment where particles are further apart: wider and stiffer."""
+    return replace(one, stiffness=2.0, width=2 * one.half_width + 0.002)

@@ -17,9 +17,9 @@ from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, Mis
 from jiggle_mj.estimator.attribution.normal_equations import less_offset, reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
-from jiggle_mj.estimator.attribution.side_by_side import T, side_by_side
 from jiggle_mj.estimator.effects.sheet_model import Moment
 from jiggle_mj.estimator.filters.implicit import reconsidered
+from jiggle_mj.estimator.side_by_side import T, side_by_side
 
 ODDS = 2.2
 """What an attachment costs: the logarithm of nine to one [nat]."""
@@ -34,8 +34,13 @@ SHORTER = (1.0, 0.4, 0.15, 0.05)
 FARTHEST, OWN_FARTHEST, FAR = 4.0, 3.0, 1.5
 """Most that an effect's parameter and one of the sheet's own may be from 0, and that one may change in a step, in prior
 standard deviations."""
-GAIN = 1e-3
-"""Share of its cost by which a step must lessen it; below, the fit has come to its end."""
+GAIN = 2.5e-4
+"""Share of its cost by which normal equations must promise that a step lessens it; below, the fit has come to its end.
+What they promise is kept to within a third near there, and to weigh all frames anew costs ten times a prediction."""
+
+
+Step = tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
+"""Of the parameters and of s."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,17 +86,13 @@ def fit(
     say: Callable[[str], None] = lambda _: None,
 ) -> Fitted:
     """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some parts."""
-    now, step = _reckoned(problem, named, point, problem.frames(parts))
+    now, steps = _reckoned(problem, named, point, problem.frames(parts))
     for count in range(passes):
-        better = _shortened(problem, now, step)
-        if better is None:
+        if (better := _better(problem, now, steps)) is None:
             break
         trial, cost = better
         say(f"pass {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
-        gained = now.cost - cost
-        now, step = _reckoned(problem, named, trial, problem.frames(parts))
-        if gained < GAIN * cost:
-            break
+        now, steps = _reckoned(problem, named, trial, problem.frames(parts))
     return now
 
 
@@ -99,15 +100,13 @@ def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
     """One more step from the end of a fit, with the frames of one part left out, by what is known there already."""
     left = [k for k in fitted.glances if problem.history.frames[k].part != part]
     glances, weights = {k: fitted.glances[k] for k in left}, {k: fitted.weights[k] for k in left}
-    now, step = _found(problem, fitted.named, fitted.point, glances, weights)
-    better = _shortened(problem, now, step)
+    now, steps = _found(problem, fitted.named, fitted.point, glances, weights)
+    better = _better(problem, now, steps, least=0.0)
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
 
-def _reckoned(
-    problem: Problem, named: np.ndarray, point: Point, frames: list[int]
-) -> tuple[Fitted, tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]]:
-    """A point with what is known there, and the step from it."""
+def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> tuple[Fitted, list[Step]]:
+    """A point with what is known there, and the steps that may be taken from it."""
     along = directions(problem, problem.free(named))
     weights = weighed(problem, point, frames)
     return _found(problem, named, point, linearised(problem, point, weights, along), weights)
@@ -115,10 +114,10 @@ def _reckoned(
 
 def _found(
     problem: Problem, named: np.ndarray, point: Point, glances: dict[int, Glance], weights: dict[int, Metric]
-) -> tuple[Fitted, tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]]:
+) -> tuple[Fitted, list[Step]]:
     free, sd = problem.free(named), problem.sd(named)
     square = reduced(problem, glances, len(free))
-    step, sites = _step(problem, square, point, free, sd)
+    steps, sites = _steps(problem, square, point, free, sd)
     found = Fitted(
         point=point,
         named=named,
@@ -127,27 +126,44 @@ def _found(
         glances=glances,
         weights=weights,
         site_precision=sites,
-        cost=cost_under(problem, weights, point) + _prior(point, free, sd),
+        cost=cost_under(problem, weights, point) + _prior(point.theta, point.s, free, sd),
     )
-    return found, step
+    return found, steps
 
 
-def _shortened(
-    problem: Problem, now: Fitted, step: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
-) -> tuple[Point, float] | None:
-    """The longest share of a step that lessens the cost, and the cost there; None if none does."""
-    free, sd, point = now.free, problem.sd(now.named), now.point
-    most = np.where(np.arange(len(free)) < len(now.named), FARTHEST, OWN_FARTHEST) * sd
-    least = np.maximum(problem.least(free), -most)
-    for share in SHORTER:
-        theta = point.theta + share * step[0]
-        theta[free] = np.clip(theta[free], least, most)
-        s = np.clip(point.s + share * step[1], 0, STIFFEST)
-        trial = start(problem, theta, s, point.states, list(now.glances))
-        cost = cost_under(problem, now.weights, trial) + _prior(trial, free, sd)
+def _better(problem: Problem, now: Fitted, steps: list[Step], *, least: float = GAIN) -> tuple[Point, float] | None:
+    """A point where the cost is less, and that; None if normal equations promise no more than `least` of it.
+
+    Of shares of steps the one that promises most is tried first. Samples may ask for stiffnesses that fit worse, where
+    a step of the parameters alone promises more.
+    """
+    there = [_after(problem, now, step, share) for step in steps for share in SHORTER]
+    promised = np.array([_promised(problem, now, *one) for one in there])
+    for k in np.argsort(-promised, kind="stable"):
+        if promised[k] <= least * now.cost:
+            return None
+        trial = start(problem, *there[k], now.point.states, list(now.glances))
+        cost = cost_under(problem, now.weights, trial) + _prior(*there[k], now.free, problem.sd(now.named))
         if cost < now.cost:
             return trial, cost
     return None
+
+
+def _after(problem: Problem, now: Fitted, step: Step, share: float) -> Step:
+    """The parameters and s after a share of a step, as far as they may go."""
+    free, sd = now.free, problem.sd(now.named)
+    most = np.where(np.arange(len(free)) < len(now.named), FARTHEST, OWN_FARTHEST) * sd
+    theta = now.point.theta + share * step[0]
+    theta[free] = np.clip(theta[free], np.maximum(problem.least(free), -most), most)
+    return theta, np.clip(now.point.s + share * step[1], 0, STIFFEST)
+
+
+def _promised(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"]) -> float:
+    """By how much the cost would be less there, by the normal equations."""
+    free, sd, point = now.free, problem.sd(now.named), now.point
+    gone = np.concatenate([s - point.s, (theta - point.theta)[free], [1.0]])
+    less = float(now.square[-1, -1] - gone @ now.square @ gone)
+    return less + _prior(point.theta, point.s, free, sd) - _prior(theta, s, free, sd)
 
 
 def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
@@ -199,7 +215,7 @@ def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, 
 
     def judged(judge: Fitted, one: Fitted) -> float:
         misfit = cost_under(problem, judge.weights, one.point)
-        return misfit + _prior(one.point, one.free, problem.sd(one.named))
+        return misfit + _prior(one.point.theta, one.point.s, one.free, problem.sd(one.named))
 
     return (judged(better, plain) - better.cost) / 2, (plain.cost - judged(plain, better)) / 2
 
@@ -224,10 +240,13 @@ def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> fl
     return float(total)
 
 
-def _step(
+def _steps(
     problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray
-) -> tuple[tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]:
-    """Of the parameters and of s, to what samples of the belief say and what fits that best; and the belief's sites."""
+) -> tuple[list[Step], Float[np.ndarray, " n"]]:
+    """To the s that samples of the belief find, and at the s at hand: each with the parameters that fit it best.
+
+    And the belief's sites.
+    """
     n, d = len(point.s), len(free)
     A = square[n : n + d, n : n + d] + np.diag(sd**-2)
     C, gs = square[:n, n : n + d], square[:n, -1]
@@ -236,12 +255,16 @@ def _step(
     shift = L @ point.s - gs + C @ np.linalg.solve(A, gt)
     stated = reconsidered(problem.prior.add(jnp.asarray(L), jnp.asarray(shift)))
     s = np.asarray(problem.prior.bounded(jnp.where(stated.probability > 0.5, stated.b, 0.0)))
-    theta = np.zeros(len(point.theta))
-    theta[free] = np.clip(-np.linalg.solve(A, gt + C.T @ (s - point.s)), -FAR * sd, FAR * sd)
     assert isinstance(stated.belief, AttachmentBelief)
-    return (theta, s - point.s), np.asarray(stated.belief.site_precision)
+
+    def step(to: Float[np.ndarray, " n"]) -> Step:
+        theta = np.zeros(len(point.theta))
+        theta[free] = np.clip(-np.linalg.solve(A, gt + C.T @ (to - point.s)), -FAR * sd, FAR * sd)
+        return theta, to - point.s
+
+    return [step(s), step(point.s)], np.asarray(stated.belief.site_precision)
 
 
-def _prior(point: Point, free: np.ndarray, sd: np.ndarray) -> float:
+def _prior(theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"], free: np.ndarray, sd: np.ndarray) -> float:
     """Twice the logarithm of the prior, its constants left out."""
-    return 2 * ODDS * float(np.sum(point.s > 0)) + float(np.sum((point.theta[free] / sd) ** 2))
+    return 2 * ODDS * float(np.sum(s > 0)) + float(np.sum((theta[free] / sd) ** 2))

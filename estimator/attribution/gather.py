@@ -55,6 +55,7 @@ def gather(
     Raises:
         PerceptionError: no frame with closed jaws could be used.
     """
+    config = replace(config or EstimatorConfig(), judging="end")
     estimator, frames, stated = Estimator(declaration, camera, config=config), [], ASSUMED_SD
     still: list[MeasuredPoints] = []
     standing: dict[int, list[MeasuredPoints]] = {}
@@ -106,7 +107,7 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, s
             y=jnp.asarray(np.nan_to_num(found.observed)),
             visible=jnp.asarray(visible),
             precision=jnp.zeros((len(visible), 3, 3)),
-            held=jnp.asarray(hold.held),
+            held=jnp.asarray(hold.firm),
             loaded=jnp.asarray(estimator.loaded(hold.held)),
             turned=jnp.asarray(hold.turned(observation.tool)),
             way=jnp.asarray(observation.tool.position - hold.tip),

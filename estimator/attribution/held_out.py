@@ -12,7 +12,7 @@ from jiggle_mj.estimator.attribution.fit import Fitted, weighed
 from jiggle_mj.estimator.attribution.linear import Metric
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
-from jiggle_mj.estimator.attribution.side_by_side import side_by_side
+from jiggle_mj.estimator.side_by_side import side_by_side
 from scipy.stats import norm
 
 ROUNDS = 2

@@ -21,6 +21,8 @@ from scipy.stats import chi2
 
 STEPS = 2
 """Of a fit from an effect's natural size."""
+HOPELESS = 4.0
+"""How many times the cost without it may be missed at that size before it is not tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +117,10 @@ def _where_natural(problem: Problem, fitted: Fitted, score: Score) -> Score:
     at = problem.sheet.place(effect.name, score.site)
     parts = {problem.history.frames[k].part for k in fitted.glances}
     begun = [moved(problem, fitted, at, np.array(one)) for one in effect.natural]
-    best = min(begun, key=lambda point: cost_under(problem, fitted.weights, point))
+    costs = [cost_under(problem, fitted.weights, point) for point in begun]
+    if min(costs) > HOPELESS * fitted.cost:
+        return score
+    best = begun[int(np.argmin(costs))]
     found = fit(problem, np.append(fitted.named, at), best, parts, passes=STEPS)
     likelier, gain = bayes_factor(problem, found, fitted, effect.sites)
     if gain <= score.log_bayes_factor:

@@ -21,6 +21,7 @@ from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Stated, Updat
 from jiggle_mj.estimator.filters.force_balance import ForceBalance, Information
 from jiggle_mj.estimator.filters.noise import Misfit, Noise
 from jiggle_mj.estimator.mesh import SheetMesh
+from jiggle_mj.estimator.side_by_side import side_by_side
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 
 SPIKE = 3e-4
@@ -195,9 +196,13 @@ class _Grasp:
     def again(self, balance: ForceBalance, s: Float[Array, " n"], noise: Noise) -> "_Grasp":
         """The same frames, linearised at s for a noise."""
         grasp, balance = _Grasp(noise), balance.widened(noise.force)
-        for evidence, x, _ in self.frames:
-            x, found, misfit = _information(balance, x, s, evidence.widened(noise.position))
-            grasp.take(evidence, x, found)
+
+        def one(k: int) -> tuple[Float[Array, "n 3"], Information, Misfit]:
+            evidence, x, _ = self.frames[k]
+            return _information(balance, x, s, evidence.widened(noise.position))
+
+        for k, (x, found, misfit) in side_by_side(one, range(len(self.frames))).items():
+            grasp.take(self.frames[k][0], x, found)
             grasp.misfit = misfit if grasp.misfit is None else grasp.misfit + misfit
         return grasp
 
