@@ -26,8 +26,8 @@ class GripHold:
     grasp: int
     held: Bool[np.ndarray, " n"]
     firm: Bool[np.ndarray, " n"]
-    """Of these, those that go with the tip in any case: the tissue may have points of its own, and at the rim of the jaws
-    lie between one that is held and one that is not."""
+    """Of these, those that go with the tip in any case: at the rim of the jaws one may lie between a point of the true
+    tissue that is held and one that is not."""
     closed_at: Float[np.ndarray, "n 3"]
     """Positions of the particles when the jaws closed [m]."""
     tip: Float[np.ndarray, " 3"]

@@ -12,6 +12,7 @@ import pytest
 from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
 from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
+from jiggle_mj.estimator.attribution.fit import fit, moved
 from jiggle_mj.estimator.attribution.gather import assumed, gather
 from jiggle_mj.estimator.attribution.sheet import closed_on, held_way
 from jiggle_mj.estimator.attribution.still_noise import measure
@@ -106,6 +107,25 @@ def test_an_undeclared_gravity_is_named_with_what_positions_cannot_tell_it_from(
     before, after = (one.rms for one in closed.reported)
     assert after < 0.7 * before
     assert after < 3**0.5 * 2 * NOISE
+
+
+def test_a_fit_finds_the_same_size_from_nothing_and_from_the_truth(light):
+    closed, _, gathered = light
+    problem, before = closed.problem, closed.stages[0].fitted
+    at, parts = problem.sheet.place("gravity"), {one.part for one in gathered.frames}
+    with jax.enable_x64(True), one_thread():
+        begun = [moved(problem, before, at, np.array([0.0, 0.0, size])) for size in (0.0, 0.8)]
+        nothing, truth = (fit(problem, at, point, parts) for point in begun)
+    assert nothing.point.theta[at] == pytest.approx(truth.point.theta[at], abs=0.03)
+
+
+def test_all_frames_are_compiled_for_as_one(light):
+    closed, _, _ = light
+    history, states = closed.problem.history, np.array([one.state for one in closed.problem.history.frames])
+    with jax.enable_x64(True):
+        moments = [history.moment(k, states) for k in range(len(states))]
+    kinds = {tuple((leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(one)) for one in moments}
+    assert len(kinds) == 1
 
 
 def test_nothing_is_named_where_nothing_is_missing():

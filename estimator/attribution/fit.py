@@ -5,28 +5,24 @@ if it lessens the misfit under the weights that it was reckoned with, so that no
 more. Stiffnesses go where samples of the belief say.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, Misfit, glance, misfit, weigh
-from jiggle_mj.estimator.attribution.normal_equations import less_offset, reduced
+from jiggle_mj.estimator.attribution.every_frame import cost_under, directions, linearised, weighed
+from jiggle_mj.estimator.attribution.linear import Glance, Metric
+from jiggle_mj.estimator.attribution.normal_equations import reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
-from jiggle_mj.estimator.effects.sheet_model import Moment
 from jiggle_mj.estimator.filters.implicit import reconsidered
-from jiggle_mj.estimator.side_by_side import T, side_by_side
 
 ODDS = 2.2
 """What an attachment costs: the logarithm of nine to one [nat]."""
 STIFFEST = 0.98
 """Largest bounded stiffness."""
-DIRECTIONS = 20
-"""Parameters that are fitted together, in most fits at most."""
 PASSES = 10
 """Most Gauss-Newton steps."""
 SHORTER = (1.0, 0.4, 0.15, 0.05)
@@ -105,6 +101,19 @@ def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
 
+def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
+    """By how much one fit explains the frames better than another, under its own weights and under the other's [nat].
+
+    Weights of different fits forgive different things, so that gains under one fit's alone do not compare.
+    """
+
+    def judged(judge: Fitted, one: Fitted) -> float:
+        misfit = cost_under(problem, judge.weights, one.point)
+        return misfit + _prior(one.point.theta, one.point.s, one.free, problem.sd(one.named))
+
+    return (judged(better, plain) - better.cost) / 2, (plain.cost - judged(plain, better)) / 2
+
+
 def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> tuple[Fitted, list[Step]]:
     """A point with what is known there, and the steps that may be taken from it."""
     along = directions(problem, problem.free(named))
@@ -138,12 +147,13 @@ def _better(problem: Problem, now: Fitted, steps: list[Step], *, least: float = 
     a step of the parameters alone promises more.
     """
     there = [_after(problem, now, step, share) for step in steps for share in SHORTER]
-    promised = np.array([_promised(problem, now, *one) for one in there])
+    promised = np.array([_promised(problem, now, theta, s) for theta, s in there])
     for k in np.argsort(-promised, kind="stable"):
         if promised[k] <= least * now.cost:
             return None
-        trial = start(problem, *there[k], now.point.states, list(now.glances))
-        cost = cost_under(problem, now.weights, trial) + _prior(*there[k], now.free, problem.sd(now.named))
+        theta, s = there[k]
+        trial = start(problem, theta, s, now.point.states, list(now.glances))
+        cost = cost_under(problem, now.weights, trial) + _prior(theta, s, now.free, problem.sd(now.named))
         if cost < now.cost:
             return trial, cost
     return None
@@ -164,80 +174,6 @@ def _promised(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: 
     gone = np.concatenate([s - point.s, (theta - point.theta)[free], [1.0]])
     less = float(now.square[-1, -1] - gone @ now.square @ gone)
     return less + _prior(point.theta, point.s, free, sd) - _prior(theta, s, free, sd)
-
-
-def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
-    """Unit vectors along parameters, padded to a width that most fits share, so that they are compiled once."""
-    along = np.zeros((problem.sheet.size, max(DIRECTIONS, len(free))))
-    along[free, np.arange(len(free))] = 1
-    return along
-
-
-def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metric]:
-    """Every frame at a point: how misfits weigh."""
-    theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
-
-    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Metric:
-        return weigh(problem.sheet, theta, s, frame, moment, x, noise)
-
-    return _each(problem, point, frames, one)
-
-
-def linearised(
-    problem: Problem, point: Point, weights: dict[int, Metric], along: Float[np.ndarray, "p d"]
-) -> dict[int, Glance]:
-    """Every frame where it was weighed: its normal equations."""
-    theta, along_ = jnp.asarray(point.theta), jnp.asarray(along)
-
-    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Glance:
-        return glance(problem.sheet, weights[k], theta, along_, frame, moment)
-
-    return _each(problem, point, weights, one)
-
-
-def _each(
-    problem: Problem,
-    point: Point,
-    frames: Iterable[int],
-    of: Callable[[int, ClosedFrame, Moment, Float[Array, "n 3"]], T],
-) -> dict[int, T]:
-    """A function of each frame, of what an effect may know of it, and of its state, at a point."""
-    states, history = jnp.asarray(point.states), problem.history
-    moments = {k: history.moment(k, states) for k in frames}
-    return side_by_side(lambda k: of(k, history.frames[k].frame, moments[k], states[k]), moments)
-
-
-def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
-    """By how much one fit explains the frames better than another, under its own weights and under the other's [nat].
-
-    Weights of different fits forgive different things, so that gains under one fit's alone do not compare.
-    """
-
-    def judged(judge: Fitted, one: Fitted) -> float:
-        misfit = cost_under(problem, judge.weights, one.point)
-        return misfit + _prior(one.point.theta, one.point.s, one.free, problem.sd(one.named))
-
-    return (judged(better, plain) - better.cost) / 2, (plain.cost - judged(plain, better)) / 2
-
-
-def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> float:
-    """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
-    total, theta = 0.0, jnp.asarray(point.theta)
-
-    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Misfit:
-        return misfit(problem.sheet, weights[k], theta, frame, moment, x)
-
-    every = _each(problem, point, weights, one)
-    for frames in problem.by_part(weights).values():
-        missed = [every[k] for k in frames]
-        tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
-        fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
-        middle = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
-        middle += np.eye(N_FIELDS) / problem.amplitude**2
-        total += sum(float(one.squared) for one in missed)
-        total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0]
-        total -= fields @ np.linalg.solve(middle, fields)
-    return float(total)
 
 
 def _steps(

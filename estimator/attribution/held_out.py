@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.fit import Fitted, weighed
+from jiggle_mj.estimator.attribution.every_frame import weighed
+from jiggle_mj.estimator.attribution.fit import Fitted
 from jiggle_mj.estimator.attribution.linear import Metric
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
-from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, weighed
+from jiggle_mj.estimator.attribution.every_frame import cost_under, weighed
+from jiggle_mj.estimator.attribution.fit import Fitted
 from jiggle_mj.estimator.attribution.linear import N_FIELDS, Metric
 from jiggle_mj.estimator.attribution.normal_equations import less_offset
 from jiggle_mj.estimator.attribution.problem import Problem

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, directions, fit, gains_over, linearised, moved
+from jiggle_mj.estimator.attribution.every_frame import cost_under, directions, linearised
+from jiggle_mj.estimator.attribution.fit import Fitted, fit, gains_over, moved
 from jiggle_mj.estimator.attribution.normal_equations import reduced, without_stiffnesses
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects.effect import Effect

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.attribution.closed_frames import USUAL_GAP, ClosedFrame, History, Timed
 from jiggle_mj.estimator.attribution.closing import Closed
-from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, weighed
+from jiggle_mj.estimator.attribution.every_frame import cost_under, weighed
+from jiggle_mj.estimator.attribution.fit import Fitted
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import from_rest
 from jiggle_mj.estimator.attribution.problem import Point, Problem

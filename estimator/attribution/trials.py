@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jiggle_mj.estimator.attribution.fit import Fitted, cost_under, fit, moved, without
+from jiggle_mj.estimator.attribution.every_frame import cost_under
+from jiggle_mj.estimator.attribution.fit import Fitted, fit, moved, without
 from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
 from jiggle_mj.estimator.attribution.problem import Point, Problem

@@ -1,0 +1,77 @@
+"""All frames of a recording at a point: how their misfits weigh, their normal equations, and what misfits cost."""
+
+from collections.abc import Callable, Iterable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
+from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, Misfit, glance, misfit, weigh
+from jiggle_mj.estimator.attribution.normal_equations import less_offset
+from jiggle_mj.estimator.attribution.problem import Point, Problem
+from jiggle_mj.estimator.effects.sheet_model import Moment
+from jiggle_mj.estimator.side_by_side import T, side_by_side
+
+DIRECTIONS = 20
+"""Parameters that are fitted together, in most fits at most."""
+
+
+def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
+    """Unit vectors along parameters, padded to a width that most fits share, so that they are compiled once."""
+    along = np.zeros((problem.sheet.size, max(DIRECTIONS, len(free))))
+    along[free, np.arange(len(free))] = 1
+    return along
+
+
+def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metric]:
+    """Every frame at a point: how misfits weigh."""
+    theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
+
+    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Metric:
+        return weigh(problem.sheet, theta, s, frame, moment, x, noise)
+
+    return _each(problem, point, frames, one)
+
+
+def linearised(
+    problem: Problem, point: Point, weights: dict[int, Metric], along: Float[np.ndarray, "p d"]
+) -> dict[int, Glance]:
+    """Every frame where it was weighed: its normal equations."""
+    theta, along_ = jnp.asarray(point.theta), jnp.asarray(along)
+
+    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Glance:
+        return glance(problem.sheet, weights[k], theta, along_, frame, moment)
+
+    return _each(problem, point, weights, one)
+
+
+def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> float:
+    """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
+    total, theta = 0.0, jnp.asarray(point.theta)
+
+    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Misfit:
+        return misfit(problem.sheet, weights[k], theta, frame, moment, x)
+
+    every = _each(problem, point, weights, one)
+    for frames in problem.by_part(weights).values():
+        missed = [every[k] for k in frames]
+        tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
+        fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
+        middle = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
+        middle += np.eye(N_FIELDS) / problem.amplitude**2
+        total += sum(float(one.squared) for one in missed)
+        total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0]
+        total -= fields @ np.linalg.solve(middle, fields)
+    return float(total)
+
+
+def _each(
+    problem: Problem,
+    point: Point,
+    frames: Iterable[int],
+    of: Callable[[int, ClosedFrame, Moment, Float[Array, "n 3"]], T],
+) -> dict[int, T]:
+    """A function of each frame, of what an effect may know of it, and of its state, at a point."""
+    states, history = jnp.asarray(point.states), problem.history
+    moments = {k: history.moment(k, states) for k in frames}
+    return side_by_side(lambda k: of(k, history.frames[k].frame, moments[k], states[k]), moments)
