@@ -120,6 +120,23 @@ def test_each_but_the_last_is_compared_again_with_what_was_tried_in_its_place(mo
     assert [one.effect.name for one in found[0].rivals] == ["gravity"]
 
 
+def test_what_was_not_told_from_an_effect_that_is_dropped_is_still_not_told_from_it(monkeypatch):
+    first, second, third = (trial(name, 300.0, 0.5) for name in ("gravity", "stretch", "friction"))
+    added = [
+        search.Added(trial=first, rivals=[trial("stretch", 250.0, 0.5)], others=[]),
+        search.Added(trial=second, rivals=[trial("bending", 250.0, 0.5)], others=[]),
+        search.Added(trial=third, rivals=[], others=[]),
+    ]
+    needless = trial("gravity", -16.0, 0.5)
+    monkeypatch.setattr(search, "_beside", lambda *_: (None, [needless]))
+    monkeypatch.setattr(search, "_with", lambda one, last: one)
+    monkeypatch.setattr(search, "refitted", lambda problem, one, fitted: one)
+    monkeypatch.setattr(search, "judged", lambda problem, one, used, say: one)
+    found = search.revised(object.__new__(Problem), added, set(), lambda said: None)
+    assert [one.trial.effect.name for one in found] == ["stretch", "friction"]
+    assert [[rival.effect.name for rival in one.rivals] for one in found] == [["bending", "gravity"], []]
+
+
 @pytest.mark.parametrize(("second_mm", "added"), [(0.4, ["gravity", "tool_scale"]), (0.55, [])])
 def test_of_two_that_are_added_together_the_second_foretells_better_than_the_first_alone(monkeypatch, second_mm, added):
     first, second = trial("gravity", 300.0, 0.5, 0.5), trial("tool_scale", 200.0, second_mm, second_mm)

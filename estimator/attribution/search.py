@@ -82,7 +82,10 @@ def revised(problem: Problem, added: list[Added], used: set[int], say: Say) -> l
         if not needed:
             say(f"{one.trial.effect.name} dropped")
             last = judged(problem, refitted(problem, rest[-1].trial, plain), used, say)
-            return [replace(other, trial=_with(other.trial, last)) for other in rest]
+            return [
+                replace(other, trial=_with(other.trial, last), rivals=other.rivals + _in_place_of(one, other))
+                for other in rest
+            ]
         again = _chosen(needed, [pair for pair in one.others if pair[0] not in others])
         rest = [replace(other, trial=_with(other.trial, again.trial)) for other in rest]
         added = [*rest[:k], again, *rest[k:]]
@@ -154,6 +157,12 @@ def _else(added: Added) -> list[Trial]:
     likely = COMPARED * added.trial.log_bayes_factor
     trials = [*added.rivals, *(one for one, _ in added.others)]
     return [one for one in trials if one.sensible and one.log_bayes_factor > likely]
+
+
+def _in_place_of(dropped: Added, other: Added) -> list[Trial]:
+    """An effect that was dropped, where it was not told from another that stays: so neither is that from it."""
+    names = [rival.effect.name for rival in dropped.rivals]
+    return [dropped.trial] if other.trial.effect.name in names else []
 
 
 def _beside(
