@@ -14,10 +14,6 @@ from scipy.spatial.transform import Rotation
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.observation import ToolState
 
-FIRM, FEWEST = 0.5, 3
-"""Share of the jaws' radius within which particles are firmly held, and how many at least. On sheets of 6.5 mm between
-vertices under jaws of 8 mm, those beyond 5 mm lag by 1 to 4 mm of 35."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class GripHold:
@@ -25,9 +21,6 @@ class GripHold:
 
     grasp: int
     held: Bool[np.ndarray, " n"]
-    firm: Bool[np.ndarray, " n"]
-    """Of these, those that go with the tip in any case: at the rim of the jaws one may lie between a point of the true
-    tissue that is held and one that is not."""
     closed_at: Float[np.ndarray, "n 3"]
     """Positions of the particles when the jaws closed [m]."""
     tip: Float[np.ndarray, " 3"]
@@ -52,9 +45,7 @@ class GripHold:
                 f"{distance.min() * 1e3:.1f} mm from the nearest particle, and the jaws reach "
                 f"{tool.radius * 1e3:.1f} mm (check the tool pose, the camera pose, or the radius)."
             )
-        firm = held & (distance <= max(FIRM * tool.radius, np.sort(distance)[:FEWEST][-1])) if named is None else named
-        tip, turn = tool.position, _orientation(tool)
-        return cls(grasp=tool.grasp, held=held, firm=firm, closed_at=positions, tip=tip, turn=turn)
+        return cls(grasp=tool.grasp, held=held, closed_at=positions, tip=tool.position, turn=_orientation(tool))
 
     def turned(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
         """Where the held particles would be if they had only turned with the tool, about the tip, since then [m]."""

@@ -52,6 +52,10 @@ MOVING, SLOW = Inertia(magnitude=0.02), 0.03
 """Frames that are taken while the tool has just stopped, and how fast it goes there [m/s]: that a report comes late
 shows in no sheet at rest."""
 
+COARSE, SHIPPED = 6.5e-3, 4.5e-3
+"""Edge lengths of the reference's mesh: for particles, of which there are fewer than in the shipped scenes; and theirs.
+A sheet that is seen is no coarser than the mesh that is laid over it: else its grip ends further inside the jaws."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
@@ -63,7 +67,7 @@ class Row:
     layout: str = "arc"
     """The shipped scene whose attachments it has."""
     sensing: Sensing = "particles"
-    spacing: float = 6.5e-3
+    spacing: float = COARSE
     """Edge length of the reference's mesh [m]; particles are its vertices, points are as many whatever it is."""
     smooth_share: float = 0.5
     """Of the noise's variance, what neighbours share."""
@@ -139,7 +143,7 @@ TOGETHER: dict[str, Row] = {
 }
 """Two effects at once."""
 IMAGES: dict[str, Row] = {
-    f"{name}, images": replace(INSIDE[name], sensing="stereo")
+    f"{name}, images": replace(INSIDE[name], sensing="stereo", spacing=SHIPPED)
     for name in ("gravity leaning", "stretch", "bed lower", "point pull", "tool scale", "image latency")
 }
 """The same from a stereo pair."""
@@ -155,7 +159,7 @@ NOTHING: dict[str, Row] = {
     "nothing, white noise": Row(smooth_share=0.0),
     "nothing, shared noise": Row(smooth_share=0.8),
     "nothing, finer reference": Row(sensing="points", spacing=3.25e-3),
-    "nothing, images": Row(sensing="stereo"),
+    "nothing, images": Row(sensing="stereo", spacing=SHIPPED),
     "nothing, U shape": Row(layout="u_shape"),
     "nothing, arc and line": Row(layout="arc_line"),
     "nothing, disc": Row(layout="large_attach"),
@@ -193,7 +197,7 @@ def scene_with(name: str, seed: int) -> Scene:
         secret=True,
         tissue=replace(arc.tissue, spacing=row.spacing, mesh="unstructured", seed=seed),
         bed=replace(arc.bed, friction=0.1),
-        attachments=tuple(_coarser(one) for one in layout.attachments),
+        attachments=tuple(_coarser(one) if row.spacing == COARSE else one for one in layout.attachments),
         tweezer=replace(arc.tweezer, radius=8e-3, speed=SLOW if MOVING in row.disturbances else arc.tweezer.speed),
         programme=pulls,
         sensing=noise,

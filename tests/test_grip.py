@@ -34,12 +34,3 @@ def test_it_turns_about_the_tip_by_as_much_as_the_tool_since_the_jaws_closed():
 def test_jaws_that_close_on_nothing_are_refused():
     with pytest.raises(PerceptionError, match=r"grasp 1 is off the tissue.*9\.0 mm from the nearest"):
         GripHold.close(tool(position=(0.0, 0.0, 9e-3)), POINTS, None)
-
-
-def test_particles_at_the_rim_are_held_but_not_firmly_unless_they_are_named():
-    points = np.array([[x, 0.0, 0.0] for x in (0.0, 1e-3, 1.2e-3, 2e-3, 2.7e-3, 9e-3)])
-    hold = GripHold.close(tool(position=(0.0, 0.0, 0.0)), points, None)
-    np.testing.assert_array_equal(hold.held, [True] * 5 + [False])
-    np.testing.assert_array_equal(hold.firm, [True] * 3 + [False] * 3)
-    named = np.array([False, True, False, False, True, False])
-    np.testing.assert_array_equal(GripHold.close(tool(), points, named).firm, named)

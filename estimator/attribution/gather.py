@@ -107,7 +107,7 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, s
             y=jnp.asarray(np.nan_to_num(found.observed)),
             visible=jnp.asarray(visible),
             precision=jnp.zeros((len(visible), 3, 3)),
-            held=jnp.asarray(hold.firm),
+            held=jnp.asarray(hold.held),
             loaded=jnp.asarray(estimator.loaded(hold.held)),
             turned=jnp.asarray(hold.turned(observation.tool)),
             way=jnp.asarray(observation.tool.position - hold.tip),
