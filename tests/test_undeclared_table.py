@@ -4,14 +4,16 @@ import json
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import get_args
 
 import pytest
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.eval import undeclared_table
 from jiggle_mj.eval.closing_the_loop import DISCREPANCY
-from jiggle_mj.eval.undeclared_panel import GROUPS, MOVING, OUTSIDE, ROWS, TOGETHER, scene_with
+from jiggle_mj.eval.undeclared_panel import COARSE, GROUPS, MOVING, OUTSIDE, ROWS, TOGETHER, scene_with
 from jiggle_mj.eval.undeclared_table import markdown, measure
+from jiggle_mj.scenes import load_scene
 
 from jiggle_mj.cli.options import RowsName
 from jiggle_mj.recording_declaration import VERSION, file_metadata
@@ -43,7 +45,15 @@ def test_scenes_differ_by_what_is_undeclared_alone_and_keep_it_secret():
     for name, row in ROWS.items():
         scene = scene_with(name, 0)
         assert len(scene.disturbances) == max(len(row.effects), name in OUTSIDE) + (MOVING in scene.disturbances)
-        assert scene.secret and scene.attachments == plain.attachments
+        assert scene.secret
+        assert scene.attachments == plain.attachments or (row.layout, row.spacing) != ("arc", COARSE)
+
+
+def test_attachments_are_as_shipped_on_a_mesh_as_fine_as_there_and_wider_and_stiffer_on_a_coarser_one():
+    shipped, (coarser,) = load_scene("arc").attachments, scene_with("nothing", 0).attachments
+    assert scene_with("nothing, images", 0).attachments == shipped
+    assert coarser == replace(shipped[0], width=0.0115, stiffness=2.0)
+    assert len(scene_with("nothing, U shape", 0).attachments) == 3
 
 
 def test_rows_are_told_apart_by_name():
