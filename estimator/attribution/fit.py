@@ -23,8 +23,8 @@ ODDS = 2.2
 """What an attachment costs: the logarithm of nine to one [nat]."""
 STIFFEST = 0.98
 """Largest bounded stiffness."""
-PASSES, PATIENCE = 10, 2
-"""Most Gauss-Newton steps, and most on end after which the cost is no less than before them."""
+PASSES = 10
+"""Most Gauss-Newton steps."""
 SHORTER = (1.0, 0.4, 0.15, 0.05)
 """Shares of a step that are tried."""
 FARTHEST, OWN_FARTHEST, FAR = 4.0, 3.0, 1.5
@@ -81,22 +81,15 @@ def fit(
     passes: int = PASSES,
     say: Callable[[str], None] = lambda _: None,
 ) -> Fitted:
-    """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some parts.
-
-    With weights of its own a point may cost more than it did with those of the point before, and attachments may come
-    and go for ever.
-    """
+    """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some parts."""
     now, steps = _reckoned(problem, named, point, problem.frames(parts))
-    best, idle = now, 0
     for count in range(passes):
-        if idle == PATIENCE or (better := _better(problem, now, steps)) is None:
+        if (better := _better(problem, now, steps)) is None:
             break
         trial, cost = better
         say(f"pass {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
         now, steps = _reckoned(problem, named, trial, problem.frames(parts))
-        idle = 0 if now.cost < (1 - GAIN) * best.cost else idle + 1
-        best = min(best, now, key=lambda one: one.cost)
-    return best
+    return now
 
 
 def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
