@@ -36,9 +36,9 @@ class EstimatorConfig:
     grip_stiffness: float = 3.0
     """Of the springs that carry held particles with the tip while the state is searched [k]."""
     judging: Judging = "grasps"
-    """When the implicit filter judges noise and belief thoroughly: whenever the jaws open, or at the end alone. For
-    a policy, which waits for the belief: at the end, and by a few samples after each of the frames, which takes a
-    second or two instead of a sweep's milliseconds."""
+    """When the implicit filter judges noise and belief thoroughly: 'grasps', whenever the jaws open; 'end', at the end
+    alone; 'frames', for a policy, which waits for the belief: at the end alone, and by a few samples after each frame,
+    which takes a second or two instead of a sweep's milliseconds."""
     detect_above: float = 0.011
     """Filters that state no probability report a particle attached when its mean stiffness exceeds this [k]."""
 

@@ -244,11 +244,12 @@ class Estimator:
         Raises:
             PerceptionError: no finite belief explains the frames together; what was believed before stays.
         """
-        self._release(thorough=True)
+        self._release(at_the_end=True)
 
-    def _release(self, *, thorough: bool) -> None:
+    def _release(self, *, at_the_end: bool = False) -> None:
         if self._filter is None:
             return
+        thorough = at_the_end or self.config.judging == "grasps"
         with jax.enable_x64(True), one_thread():
             if (again := self._filter.release(self._belief, thorough=thorough)) is not None:
                 self._judge(again)
@@ -282,12 +283,12 @@ class Estimator:
             self._change(event, observation.index)
         assert self._filter is not None
         if not tool.closed:
-            self._release(thorough=self.config.judging == "grasps")
+            self._release()
             self._hold = self._closing = None
             self._idle = observation
             return None
         if self._closing is None or self._closing.grasp != tool.grasp:
-            self._release(thorough=self.config.judging == "grasps")
+            self._release()
             self._closing = tool
         began = time.perf_counter()
         track = self._see(observation)
@@ -329,7 +330,7 @@ class Estimator:
         if not region.any():
             self.skipped.append((index, f"the {type(event).__name__.lower()} is beside the sheet, and was left out"))
             return
-        self._release(thorough=self.config.judging == "grasps")
+        self._release()
         assert self._filter is not None
         if isinstance(self._belief, AttachmentBelief) and isinstance(self._filter, ImplicitFilter):
             if self.changes:

@@ -197,7 +197,7 @@ def scene_with(name: str, seed: int) -> Scene:
         secret=True,
         tissue=replace(arc.tissue, spacing=row.spacing, mesh="unstructured", seed=seed),
         bed=replace(arc.bed, friction=0.1),
-        attachments=tuple(_coarser(one) if row.spacing == COARSE else one for one in layout.attachments),
+        attachments=tuple(_coarser(one) if row.spacing > SHIPPED else one for one in layout.attachments),
         tweezer=replace(arc.tweezer, radius=8e-3, speed=SLOW if MOVING in row.disturbances else arc.tweezer.speed),
         programme=pulls,
         sensing=noise,

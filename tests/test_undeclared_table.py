@@ -11,7 +11,7 @@ import pytest
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.eval import undeclared_table
 from jiggle_mj.eval.closing_the_loop import DISCREPANCY
-from jiggle_mj.eval.undeclared_panel import COARSE, GROUPS, MOVING, OUTSIDE, ROWS, TOGETHER, scene_with
+from jiggle_mj.eval.undeclared_panel import GROUPS, MOVING, NOTHING, OUTSIDE, ROWS, SHIPPED, TOGETHER, scene_with
 from jiggle_mj.eval.undeclared_table import markdown, measure
 from jiggle_mj.scenes import load_scene
 
@@ -40,17 +40,17 @@ def found(
 
 
 def test_scenes_differ_by_what_is_undeclared_alone_and_keep_it_secret():
-    plain = scene_with("nothing", 0)
-    assert plain.disturbances == ()
+    assert scene_with("nothing", 0).disturbances == ()
+    plain = {(row.layout, row.spacing): scene_with(name, 0).attachments for name, row in NOTHING.items()}
     for name, row in ROWS.items():
         scene = scene_with(name, 0)
         assert len(scene.disturbances) == max(len(row.effects), name in OUTSIDE) + (MOVING in scene.disturbances)
-        assert scene.secret
-        assert scene.attachments == plain.attachments or (row.layout, row.spacing) != ("arc", COARSE)
+        assert scene.secret and scene.attachments == plain[row.layout, row.spacing]
 
 
 def test_attachments_are_as_shipped_on_a_mesh_as_fine_as_there_and_wider_and_stiffer_on_a_coarser_one():
     shipped, (coarser,) = load_scene("arc").attachments, scene_with("nothing", 0).attachments
+    assert load_scene("arc").tissue.spacing == SHIPPED
     assert scene_with("nothing, images", 0).attachments == shipped
     assert coarser == replace(shipped[0], width=0.0115, stiffness=2.0)
     assert len(scene_with("nothing, U shape", 0).attachments) == 3

@@ -33,8 +33,6 @@ standard deviations."""
 GAIN = 2.5e-4
 """Share of its cost by which normal equations must promise that a step lessens it; below, the fit has come to its end.
 What they promise is kept to within a third near there, and to weigh all frames anew costs ten times a prediction."""
-
-
 Step = tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
 """Of the parameters and of s."""
 
@@ -106,12 +104,9 @@ def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, 
 
     Weights of different fits forgive different things, so that gains under one fit's alone do not compare.
     """
-
-    def judged(judge: Fitted, one: Fitted) -> float:
-        misfit = cost_under(problem, judge.weights, one.point)
-        return misfit + _prior(one.point.theta, one.point.s, one.free, problem.sd(one.named))
-
-    return (judged(better, plain) - better.cost) / 2, (plain.cost - judged(plain, better)) / 2
+    plain_there = _cost(problem, better.weights, plain.point, plain.named)
+    better_there = _cost(problem, plain.weights, better.point, better.named)
+    return (plain_there - better.cost) / 2, (plain.cost - better_there) / 2
 
 
 def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> tuple[Fitted, list[Step]]:
@@ -135,7 +130,7 @@ def _found(
         glances=glances,
         weights=weights,
         site_precision=sites,
-        cost=cost_under(problem, weights, point) + _prior(point.theta, point.s, free, sd),
+        cost=_cost(problem, weights, point, named),
     )
     return found, steps
 
@@ -153,7 +148,7 @@ def _better(problem: Problem, now: Fitted, steps: list[Step], *, least: float = 
             return None
         theta, s = there[k]
         trial = start(problem, theta, s, now.point.states, list(now.glances))
-        cost = cost_under(problem, now.weights, trial) + _prior(theta, s, now.free, problem.sd(now.named))
+        cost = _cost(problem, now.weights, trial, now.named)
         if cost < now.cost:
             return trial, cost
     return None
@@ -199,6 +194,12 @@ def _steps(
         return theta, to - point.s
 
     return [step(s), step(point.s)], np.asarray(stated.belief.site_precision)
+
+
+def _cost(problem: Problem, weights: dict[int, Metric], point: Point, named: np.ndarray) -> float:
+    """Of a point with those parameters free, under weights that may have been reckoned elsewhere; see `Fitted.cost`."""
+    prior = _prior(point.theta, point.s, problem.free(named), problem.sd(named))
+    return cost_under(problem, weights, point) + prior
 
 
 def _prior(theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"], free: np.ndarray, sd: np.ndarray) -> float:
