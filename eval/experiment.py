@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import Disparity, TissueMask
+from jiggle_mj.estimator.policies.policy import Decision
 from jiggle_mj.eval.acting import actions, acts, check_goes_with, policy_named
 from jiggle_mj.eval.report import shown_steps, write_report
 from jiggle_mj.eval.score import IDENTITY, RECORDED, Json, read_scorable, result, score_read, write_result
@@ -113,7 +114,7 @@ def run_scene(
         disturbances=reference.metadata.get("disturbances"),
         simulation_s=watch.seconds,
         limits=scene.limits.limits(),
-        plan_s=[] if chooses is None else [one.plan_s for one in chooses.decisions],
+        decisions=[] if chooses is None else chooses.decisions,
         ended=None if chooses is None else chooses.ended,
         procedure=acts(chooses, estimator),
     )
@@ -258,7 +259,7 @@ def _result(
     disturbances: str | None,
     simulation_s: float | None = None,
     limits: Limits | None = None,
-    plan_s: Sequence[float] = (),
+    decisions: Sequence[Decision] = (),
     ended: str | None = None,
     procedure: Json | None = None,
 ) -> Json:
@@ -277,7 +278,7 @@ def _result(
         skipped=episode.skipped,
         simulation_s=simulation_s,
         limits=limits,
-        plan_s=plan_s,
+        decisions=decisions,
         ended=ended,
         procedure=procedure,
     )

@@ -9,6 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool
@@ -24,6 +25,9 @@ from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
 from jiggle_mj.limits import Limits
 from jiggle_mj.truth import Truth
 from jiggle_mj.truth_recording import read_truth
+
+if TYPE_CHECKING:
+    from jiggle_mj.estimator.policies.policy import Decision
 
 Json = dict[str, object]
 RECORDED, IDENTITY = "recording", "recording.identity"
@@ -47,7 +51,7 @@ def result(
     skipped: Sequence[tuple[int, str]] = (),
     simulation_s: float | None = None,
     limits: Limits | None = None,
-    plan_s: Sequence[float] = (),
+    decisions: Sequence["Decision"] = (),
     ended: str | None = None,
     procedure: Json | None = None,
 ) -> Json:
@@ -68,7 +72,7 @@ def result(
         skipped: index and reason of each frame that was left out.
         simulation_s: wall time of the reference tissue, all frames [s]; None for a recording.
         limits: of what the attachments may bear; None for a recording.
-        plan_s: wall time of each plan of a policy [s].
+        decisions: what a policy planned, in order.
         ended: why a policy planned no more.
         procedure: of one that cuts or sews, its name and what was seen of each act; see `acting.acts`.
     """
@@ -104,6 +108,7 @@ def result(
             "max_force_n": None,
             "force_violations": None,
         },
+        "decisions": [{"does": one.does, "why": one.why, "plan_s": one.plan_s} for one in decisions],
         "ended": ended,
         "procedure": procedure,
         "entropy": {
@@ -121,7 +126,7 @@ def result(
                 "p95": float(np.percentile(update, 95)) if len(update) else None,
             },
             "perception_s": float(np.median(perception)) if len(perception) else None,
-            "plan_s": float(np.median(plan_s)) if len(plan_s) else None,
+            "plan_s": float(np.median([one.plan_s for one in decisions])) if decisions else None,
             "simulation_s": _number(simulation_s),
         },
     }

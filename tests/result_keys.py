@@ -14,6 +14,7 @@ KEYS = {
     "safety": dict.fromkeys(
         ("limit_j", "max_mean_boundary_energy_j", "violations", "limit_n", "max_force_n", "force_violations")
     ),
+    "decisions": None,
     "ended": None,
     "procedure": None,
     "entropy": dict.fromkeys(("prior", "final")),

@@ -62,6 +62,8 @@ def test_ours_looks_grasps_and_pulls_in_steps_and_learns(ours):
     assert moved[0] == pytest.approx(STEP)
     assert len(policy.decisions) == 8 and policy.ended == "all 8 steps are done"
     assert all(one.why and one.plan_s > 0 for one in policy.decisions)
+    words = [one.does for one in policy.decisions]
+    assert words[0].startswith("grasp at (") and words[1].startswith("move to (") and words[1].endswith(") mm")
     assert loop.entropy[-1] < loop.entropy[0] < loop.estimator.prior_entropy
 
 
@@ -127,7 +129,7 @@ def test_a_tip_out_of_reach_is_taken_back_and_it_says_where_it_was(ours, monkeyp
     far = replace(loop.estimator.tool, position=np.array([0.0, 0.0, 0.2]))
     monkeypatch.setattr(Estimator, "tool", property(lambda _: far))
     action, why = Information(Limits(), radius=8e-3, seed=0).plan(loop.estimator)
-    assert isinstance(action, Move) and "the tip at 0 0 200 mm is out of reach" in why
+    assert isinstance(action, Move) and "the tip at (0, 0, 200) mm is out of reach" in why
     np.testing.assert_array_equal(action.to, loop.estimator.hold.tip)
 
 
@@ -161,6 +163,8 @@ def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, mo
     figures = json.loads(capsys.readouterr().out)
     assert keys(figures) == KEYS
     assert figures["policy"] == "pmp-up" and figures["ended"] == "all 3 steps are done"
+    assert [one["does"][:7] for one in figures["decisions"]] == ["move to"] * 3
+    assert "What it did, and why" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert figures["timing"]["plan_s"] > 0 and figures["safety"]["limit_n"] == 1e-5
     safety = figures["safety"]
     assert safety["force_violations"] > 0 and safety["max_force_n"] > 1e-5

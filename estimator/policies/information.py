@@ -26,7 +26,7 @@ from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.estimator.mesh import SheetMesh, far_apart
 from jiggle_mj.estimator.outlook import Outcome, Outlook, Tug
 from jiggle_mj.estimator.policies.outcomes import outcomes
-from jiggle_mj.estimator.policies.policy import STEP, Policy
+from jiggle_mj.estimator.policies.policy import STEP, Policy, in_mm
 from jiggle_mj.estimator.policies.tweezer import Tweezer
 from jiggle_mj.estimator.policies.workspace import Workspace
 
@@ -146,8 +146,7 @@ class Information(Policy):
             elif self._reached(estimator, tool.position + STEP * DIRECTIONS).any():
                 self._leaving = "no pull from here is safe"
             else:
-                at = " ".join(f"{1e3 * part:.0f}" for part in tool.position)
-                self._leaving = f"the tip at {at} mm is out of reach, or the tool touches the bed"
+                self._leaving = f"the tip at {in_mm(tool.position)} is out of reach, or the tool touches the bed"
             if not self.regrasps:
                 return self._leaving
             if np.linalg.norm(tool.position - hold.tip) < STEP / 10:

@@ -9,10 +9,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Float
 from jiggle_mj.estimator.estimator import Estimator
 
 from jiggle_mj.errors import ActionError
-from jiggle_mj.observation import Action
+from jiggle_mj.observation import Action, Grasp, Move
 
 STEP = 5e-3
 """Gamma: longest way of the tip from one look at the tissue to the next, with tissue in the jaws [m]."""
@@ -27,6 +29,22 @@ class Decision:
     """Wall time of the plan [s]."""
     why: str
     """In words."""
+
+    @property
+    def does(self) -> str:
+        """The action in words."""
+        match self.action:
+            case Grasp(point=place):
+                return f"grasp at {in_mm(place)}"
+            case Move(to=place):
+                return f"move to {in_mm(place)}"
+            case other:
+                return type(other).__name__.lower()
+
+
+def in_mm(place: Float[np.ndarray, " 3"]) -> str:
+    """A place in words."""
+    return f"({', '.join(f'{1e3 * part:.0f}' for part in place)}) mm"
 
 
 class Policy(ABC):
