@@ -17,14 +17,14 @@ from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.config import EstimatorConfig
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.filters.build import build_filter
-from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull, Stated
+from jiggle_mj.estimator.filters.evidence import Filter, Stated
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.estimator.fusion import fused, pull, slip
 from jiggle_mj.estimator.grip import GripHold
 from jiggle_mj.estimator.identification import identify
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.outlook import Outlook
-from jiggle_mj.estimator.perception import CloudTracker, Disparity, PointTracker, StereoTracker, TissueMask, Track
-from jiggle_mj.estimator.perception.cloud_tracker import lay_mesh
+from jiggle_mj.estimator.perception import Believed, Disparity, Sight, TissueMask, Track
 from jiggle_mj.estimator.perception.mesh_field import MeshField
 from jiggle_mj.estimator.topology import Change, after, meant_by, region_of
 
@@ -33,7 +33,7 @@ from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.material import Material, material
 from jiggle_mj.mesh_checks import check_unfolded
-from jiggle_mj.observation import Cut, Declaration, MeasuredPoints, Observation, StereoPair, Suture, ToolState
+from jiggle_mj.observation import Cut, Declaration, Observation, Suture, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
 RULE = "P(attached) > 0.5"
@@ -66,20 +66,13 @@ class Estimator:
         self.declaration, self.config = declaration, config or EstimatorConfig()
         self.skipped: list[tuple[int, str]] = []
         """Index and reason of each observation that could not be used."""
-        self._stereo = (
-            None
-            if camera is None
-            else StereoTracker(camera, spacing=self.config.spacing, mask=mask, disparity=disparity)
-        )
-        self._points = PointTracker(declaration.mesh)
-        self._clouds: CloudTracker | None = None
-        self._still: list[MeasuredPoints] = []
+        self._sight = Sight(declaration, camera, spacing=self.config.spacing, mask=mask, disparity=disparity)
         self._sheet: Sheet | None = None
         self._filter: Filter | None = None
         self._hold: GripHold | None = None
         self._closing: ToolState | None = None
         self._tool: ToolState | None = None
-        self._sight = np.eye(3) * SEEN**-2
+        self._sharpness = np.eye(3) * SEEN**-2
         self.changes: list[Change] = []
         """Cuts and sutures so far, as the belief took them; of the filter 'implicit' alone."""
         self._idle: Observation | None = None
@@ -106,7 +99,7 @@ class Estimator:
             MeshError: the sheet at rest is folded, or not one sheet.
         """
         if self._filter is None:
-            if self._sheet is None and not self._still:
+            if not self._sight.ready:
                 raise PerceptionError("no frame has shown the sheet yet; wait for one before planning a grasp.")
             with jax.enable_x64(True), one_thread():
                 self._filter = self._begin()
@@ -131,7 +124,7 @@ class Estimator:
     @property
     def track_ids(self) -> Int[np.ndarray, " n"] | None:
         """Which tracked point each particle is; None where they have no names."""
-        return self._points.ids if len(self._points.ids) else None
+        return self._sight.track_ids
 
     @property
     def slip(self) -> float:
@@ -161,7 +154,7 @@ class Estimator:
         implicit, belief = self._implicit("predicts pulls")
         position = 1.0 if implicit.noise is None else implicit.noise.position
         asked = jnp.ones(len(self._x), dtype=bool) if about is None else jnp.asarray(about)
-        sight = jnp.asarray(self._sight / position)
+        sight = jnp.asarray(self._sharpness / position)
         return Outlook.build(implicit.balance, belief, sight, asked)
 
     @property
@@ -275,7 +268,8 @@ class Estimator:
     def _update(self, observation: Observation) -> Estimate | None:
         tool = self._tool = observation.tool
         if self._filter is None:
-            self._look_at_rest(observation)
+            if (passed_over := self._sight.look_at_rest(observation)) is not None:
+                self.skipped.append((observation.index, passed_over))
             if not (tool.closed or observation.events):
                 return None
             self.begin()
@@ -297,7 +291,9 @@ class Estimator:
             self.skipped.append((observation.index, "no particle was seen"))
             return None
         hold, before = self._grip(track, tool)
-        evidence, start = self._evidence(track, tool, hold, before)
+        self._slip = slip(track, hold, tool)
+        self._sharpness = np.linalg.inv(track.covariance[track.visible]).mean(axis=0)
+        evidence, start = fused(track, hold, tool, before, grip_sd=self.config.grip_sd, field=self._field)
         update = self._filter.update(self._belief, jnp.asarray(self._b), evidence, jnp.asarray(start))
         if not (np.isfinite(update.x).all() and np.isfinite(update.b).all()):
             raise PerceptionError(
@@ -380,33 +376,9 @@ class Estimator:
         if self._filter is None:
             raise ValueError("the sheet is not known before the first frame with closed jaws; call update first.")
 
-    def _look_at_rest(self, observation: Observation) -> None:
-        """Use a frame before the first grasp: the first image, every cloud of points."""
-        if observation.images is not None and self._stereo is not None:
-            if self._sheet is None:
-                self._start(observation.index, observation.images, observation.tool)
-        elif observation.points is not None:
-            if not (observation.tool.closed and self._still):
-                self._still.append(observation.points)
-        else:
-            raise PerceptionError(
-                f"observation {observation.index} has neither points nor images with a calibrated camera."
-            )
-
-    def _start(self, index: int, images: StereoPair, tool: ToolState) -> None:
-        """Lay the mesh over an image; one that cannot be used is passed over while another may come."""
-        assert self._stereo is not None
-        try:
-            self._sheet = self._stereo.start(images, tool)
-        except PerceptionError as failure:
-            if tool.closed:
-                raise
-            self.skipped.append((index, str(failure)))
-
     def _begin(self) -> Filter:
         """Build the model once the rest shape is known."""
-        if self._sheet is None:
-            self._sheet = self._rest_of_points()
+        self._sheet = self._sight.sheet()
         mesh, plane = SheetMesh(self._sheet.rest, self._sheet.faces), SheetPlane.through(self._sheet.rest)
         check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
         self._field = MeshField(plane.flatten(mesh.rest), mesh.faces)
@@ -417,41 +389,21 @@ class Estimator:
         self._sd = self._probability = np.full(mesh.n, np.nan)
         return found
 
-    def _rest_of_points(self) -> Sheet:
-        """The sheet at rest, as points with identities show it, or clouds without."""
-        if all(points.track_id is not None for points in self._still):
-            return self._points.start(self._still)
-        declared = self.declaration.mesh
-        sheet = (
-            lay_mesh(self._still, spacing=self.config.spacing)
-            if declared is None
-            else Sheet(rest=declared.vertices, faces=declared.faces)
-        )
-        self._clouds = CloudTracker(sheet, self.declaration)
-        return sheet
+    def _see(self, observation: Observation) -> Track:
+        return self._sight.track(observation, predicted=self._x, believed=lambda: self._believed(observation.tool))
 
-    def _meet(self, points: MeasuredPoints, tool: ToolState) -> Track:
-        """A cloud without identities, from the state before, the tip having moved."""
-        assert self._clouds is not None
+    def _believed(self, tool: ToolState) -> Believed:
+        """What a cloud is met with: the state before, and how the tip has moved."""
         hold, before = self._grip(Track.of_nothing(len(self._x)), tool)
         stiffness = jnp.where(hold.held, self.config.grip_stiffness * self.declaration.membrane_stiffness, 0.0)
-        pull = _pull(before, tool, hold)
-        return self._clouds.track(points, before, self._b, Grip.of(pull.tip, pull.length, stiffness))
-
-    def _see(self, observation: Observation) -> Track:
-        if observation.images is not None and self._stereo is not None:
-            return self._stereo.track(observation.images, observation.tool, predicted=self._x)
-        if observation.points is not None:
-            if self._clouds is not None:
-                return self._meet(observation.points, observation.tool)
-            return self._points.track(observation.points)
-        raise PerceptionError(f"observation {observation.index} has neither points nor images; one is needed.")
+        moved = pull(before, tool, hold)
+        return before, self._b, Grip.of(moved.tip, moved.length, stiffness)
 
     def _lies(self, observation: Observation) -> Float[np.ndarray, "n 3"]:
         """Where the sheet lies with the jaws open; what is not seen moves with its surroundings."""
         rest = self.sheet.rest
         try:
-            if self._clouds is not None:
+            if not self._sight.identifies:
                 return rest
             track = self._see(observation)
         except PerceptionError:
@@ -478,47 +430,10 @@ class Estimator:
             self._closing = None  # a later frame of this grasp may know better
             raise
 
-    def _evidence(
-        self, track: Track, tool: ToolState, hold: GripHold, before: Float[np.ndarray, "n 3"]
-    ) -> tuple[Evidence, Float[np.ndarray, "n 3"]]:
-        """Fuse what was seen with what the grip says; and a start for the state, smooth where nothing was seen."""
-        seen, held, expected = track.visible, hold.held, hold.expected(tool)
-        off = np.linalg.norm((track.positions - expected)[seen & held], axis=1)
-        self._slip = float(np.median(off)) if len(off) else 0.0
-        precision = np.where(seen[:, None, None], np.linalg.inv(track.covariance), 0.0)
-        self._sight = precision[seen].mean(axis=0)
-        weighed = np.einsum("nij,nj->ni", precision, np.nan_to_num(track.positions))
-        grip = np.where(held, self.config.grip_sd**-2, 0.0)
-        precision = precision + grip[:, None, None] * np.eye(3)
-        weighed = weighed + grip[:, None] * expected
-        known = seen | held
-        y = np.where(
-            known[:, None],
-            np.linalg.solve(np.where(known[:, None, None], precision, np.eye(3)), weighed[..., None])[..., 0],
-            0,
-        )
-        motion = np.where(known[:, None], y - before, 0.0)
-        start = before + np.where(held[:, None], motion, self._field.fill(motion, known, stiffness=1.0))
-        y = np.where(known[:, None], y, start)
-        evidence = Evidence(
-            y=jnp.asarray(y),
-            precision=jnp.asarray(precision),
-            held=jnp.asarray(held),
-            loaded=jnp.asarray(self._field.widened(held)),
-            pull=_pull(before, tool, hold),
-        )
-        return evidence, start
-
     def _named(self, tool: ToolState) -> Bool[np.ndarray, " n"] | None:
         """Particles that the recording or the declaration says are held; only points have names."""
-        if not len(self._points.ids):
+        if (ids := self._sight.track_ids) is None:
             return None
         if tool.held_tracks:
-            return np.isin(self._points.ids, tool.held_tracks)
+            return np.isin(ids, tool.held_tracks)
         return None if self.declaration.mesh is None else self.declaration.mesh.held
-
-
-def _pull(before: Float[np.ndarray, "n 3"], tool: ToolState, hold: GripHold) -> Pull:
-    """The step of the tool that led to a frame."""
-    length = np.linalg.norm(hold.closed_at - hold.tip, axis=1)
-    return Pull(before=jnp.asarray(before), tip=jnp.asarray(tool.position), length=jnp.asarray(length))

@@ -1,0 +1,66 @@
+"""One frame's evidence: what was seen of the particles, and what the tool says of those that it holds."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from jiggle_mj.estimator.filters.evidence import Evidence, Pull
+from jiggle_mj.estimator.grip import GripHold
+from jiggle_mj.estimator.perception.mesh_field import MeshField
+from jiggle_mj.estimator.perception.track import Track
+
+from jiggle_mj.observation import ToolState
+
+
+def fused(
+    track: Track,
+    hold: GripHold,
+    tool: ToolState,
+    before: Float[np.ndarray, "n 3"],
+    *,
+    grip_sd: float,
+    field: MeshField,
+) -> tuple[Evidence, Float[np.ndarray, "n 3"]]:
+    """Evidence, and a start for the state, smooth where nothing was seen.
+
+    Args:
+        track: what was seen.
+        hold: the grasp.
+        tool: where it is now.
+        before: the state of the frame before, or at rest where the jaws have just closed [m].
+        grip_sd: how well held particles follow the tip [m].
+        field: fills what is unknown from its surroundings.
+    """
+    seen, held, expected = track.visible, hold.held, hold.expected(tool)
+    precision = np.where(seen[:, None, None], np.linalg.inv(track.covariance), 0.0)
+    weighed = np.einsum("nij,nj->ni", precision, np.nan_to_num(track.positions))
+    grip = np.where(held, grip_sd**-2, 0.0)
+    precision = precision + grip[:, None, None] * np.eye(3)
+    weighed = weighed + grip[:, None] * expected
+    known = seen | held
+    y = np.where(
+        known[:, None],
+        np.linalg.solve(np.where(known[:, None, None], precision, np.eye(3)), weighed[..., None])[..., 0],
+        0,
+    )
+    motion = np.where(known[:, None], y - before, 0.0)
+    start = before + np.where(held[:, None], motion, field.fill(motion, known, stiffness=1.0))
+    evidence = Evidence(
+        y=jnp.asarray(np.where(known[:, None], y, start)),
+        precision=jnp.asarray(precision),
+        held=jnp.asarray(held),
+        loaded=jnp.asarray(field.widened(held)),
+        pull=pull(before, tool, hold),
+    )
+    return evidence, start
+
+
+def pull(before: Float[np.ndarray, "n 3"], tool: ToolState, hold: GripHold) -> Pull:
+    """The step of the tool that led to a frame."""
+    length = np.linalg.norm(hold.closed_at - hold.tip, axis=1)
+    return Pull(before=jnp.asarray(before), tip=jnp.asarray(tool.position), length=jnp.asarray(length))
+
+
+def slip(track: Track, hold: GripHold, tool: ToolState) -> float:
+    """How far the held particles are seen from where the tip should have taken them, in the median [m]; 0 unseen."""
+    off = np.linalg.norm((track.positions - hold.expected(tool))[track.visible & hold.held], axis=1)
+    return float(np.median(off)) if len(off) else 0.0
