@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jiggle_mj.estimator.attribution import fit as fitting
 from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
 from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
@@ -117,6 +118,16 @@ def test_a_fit_finds_the_same_size_from_nothing_and_from_the_truth(light):
         begun = [moved(problem, before, at, np.array([0.0, 0.0, size])) for size in (0.0, 0.8)]
         nothing, truth = (fit(problem, at, point, parts) for point in begun)
     assert nothing.point.theta[at] == pytest.approx(truth.point.theta[at], abs=0.03)
+
+
+def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
+    """Where a sheet has folded, say."""
+    closed, *_ = light
+    begun = closed.stages[0].fitted
+    there = iter([(begun, []), (dataclasses.replace(begun, cost=np.nan), [])])
+    monkeypatch.setattr(fitting, "_reckoned", lambda *_: next(there))
+    monkeypatch.setattr(fitting, "_better", lambda *_: (begun.point, begun.cost - 1))
+    assert fit(closed.problem, begun.named, begun.point, {1}) is begun
 
 
 def test_all_frames_are_compiled_for_as_one(light):

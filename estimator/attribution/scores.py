@@ -124,7 +124,7 @@ def _where_natural(problem: Problem, fitted: Fitted, score: Score) -> Score:
     best = begun[int(np.argmin(costs))]
     found = fit(problem, np.append(fitted.named, at), best, parts, passes=STEPS)
     likelier, gain = bayes_factor(problem, found, fitted, effect.sites)
-    if gain <= score.log_bayes_factor:
+    if not gain > score.log_bayes_factor:
         return score
     return replace(
         score,
