@@ -17,6 +17,7 @@ def test_a_small_benchmark_has_its_figures_and_finds_the_disc():
     json.dumps(metrics, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_beyond_the_largest_belief_the_solver_alone_is_timed(monkeypatch):
     monkeypatch.setattr(bench, "LARGEST", 0)
     metrics = bench.benchmark((40, 85), paper=False, say=lambda _: None)

@@ -45,6 +45,8 @@ def unscented() -> Filter:
 
 
 FILTERS = (implicit, explicit, adam, nnls, unscented)
+LONGEST = (adam, unscented)
+"""Baselines whose frames take longest."""
 
 
 def frame(number: int, hidden: np.ndarray | None = None, lie: float = 0.0) -> Evidence:
@@ -74,7 +76,7 @@ def run(filter: Filter, frames: list[Evidence]):
     return outcomes
 
 
-@pytest.mark.parametrize("make", FILTERS)
+@pytest.mark.parametrize("make", [pytest.param(one, marks=[pytest.mark.slow] * (one in LONGEST)) for one in FILTERS])
 def test_every_filter_sharpens_stays_non_negative_and_repeats_itself(make):
     frames = [frame(number) for number in (1, 2, 3)]
     first, second = run(make(), frames), run(make(), frames)

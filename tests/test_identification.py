@@ -78,6 +78,7 @@ def test_the_attachments_are_found_with_the_right_sheet(runs):
         assert (found == attached()).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_frames_at_rest_say_nothing():
     """The first of each lift, where nothing has moved yet."""
     filter, frames = ImplicitFilter(sheet_balance(1e-4)), lifts()[::4]
