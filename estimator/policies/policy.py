@@ -44,7 +44,7 @@ class Decision:
 
 def in_mm(place: Float[np.ndarray, " 3"]) -> str:
     """A place in words."""
-    return f"({', '.join(f'{1e3 * part:.0f}' for part in place)}) mm"
+    return f"({', '.join(str(round(1e3 * float(part))) for part in place)}) mm"
 
 
 class Policy(ABC):
