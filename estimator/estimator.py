@@ -19,7 +19,7 @@ from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.evidence import Filter, Stated
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
-from jiggle_mj.estimator.fusion import fused, pull, slip
+from jiggle_mj.estimator.fusion import fused, pull
 from jiggle_mj.estimator.grip import GripHold
 from jiggle_mj.estimator.identification import identify
 from jiggle_mj.estimator.mesh import SheetMesh
@@ -67,7 +67,6 @@ class Estimator:
         self.skipped: list[tuple[int, str]] = []
         """Index and reason of each observation that could not be used."""
         self._sight = Sight(declaration, camera, spacing=self.config.spacing, mask=mask, disparity=disparity)
-        self._sheet: Sheet | None = None
         self._filter: Filter | None = None
         self._hold: GripHold | None = None
         self._closing: ToolState | None = None
@@ -88,8 +87,7 @@ class Estimator:
             ValueError: asked before the first frame with closed jaws.
         """
         self._check_begun()
-        assert self._sheet is not None
-        return self._sheet
+        return self._sight.sheet()
 
     def begin(self) -> Sheet:
         """Fix the sheet by the frames so far, before the jaws close, so that a first grasp can be planned.
@@ -291,10 +289,9 @@ class Estimator:
             self.skipped.append((observation.index, "no particle was seen"))
             return None
         hold, before = self._grip(track, tool)
-        self._slip = slip(track, hold, tool)
-        self._sharpness = np.linalg.inv(track.covariance[track.visible]).mean(axis=0)
-        evidence, start = fused(track, hold, tool, before, grip_sd=self.config.grip_sd, field=self._field)
-        update = self._filter.update(self._belief, jnp.asarray(self._b), evidence, jnp.asarray(start))
+        frame = fused(track, hold, tool, before, grip_sd=self.config.grip_sd, field=self._field)
+        self._slip, self._sharpness = frame.slip, track.precision[track.visible].mean(axis=0)
+        update = self._filter.update(self._belief, jnp.asarray(self._b), frame.evidence, jnp.asarray(frame.start))
         if not (np.isfinite(update.x).all() and np.isfinite(update.b).all()):
             raise PerceptionError(
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
@@ -378,8 +375,8 @@ class Estimator:
 
     def _begin(self) -> Filter:
         """Build the model once the rest shape is known."""
-        self._sheet = self._sight.sheet()
-        mesh, plane = SheetMesh(self._sheet.rest, self._sheet.faces), SheetPlane.through(self._sheet.rest)
+        sheet = self._sight.sheet()
+        mesh, plane = SheetMesh(sheet.rest, sheet.faces), SheetPlane.through(sheet.rest)
         check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
         self._field = MeshField(plane.flatten(mesh.rest), mesh.faces)
         found, self._belief = build_filter(mesh, self.declaration, self.config)

@@ -1,5 +1,7 @@
 """One frame's evidence: what was seen of the particles, and what the tool says of those that it holds."""
 
+from dataclasses import dataclass
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +13,17 @@ from jiggle_mj.estimator.perception.track import Track
 from jiggle_mj.observation import ToolState
 
 
+@dataclass(frozen=True, kw_only=True)
+class Fused:
+    """One frame."""
+
+    evidence: Evidence
+    start: Float[np.ndarray, "n 3"]
+    """For a search of the state, smooth where nothing was seen [m]."""
+    slip: float
+    """How far the held particles are seen from where the tip should have taken them, in the median; 0 unseen [m]."""
+
+
 def fused(
     track: Track,
     hold: GripHold,
@@ -19,8 +32,8 @@ def fused(
     *,
     grip_sd: float,
     field: MeshField,
-) -> tuple[Evidence, Float[np.ndarray, "n 3"]]:
-    """Evidence, and a start for the state, smooth where nothing was seen.
+) -> Fused:
+    """Put both together.
 
     Args:
         track: what was seen.
@@ -31,10 +44,10 @@ def fused(
         field: fills what is unknown from its surroundings.
     """
     seen, held, expected = track.visible, hold.held, hold.expected(tool)
-    precision = np.where(seen[:, None, None], np.linalg.inv(track.covariance), 0.0)
-    weighed = np.einsum("nij,nj->ni", precision, np.nan_to_num(track.positions))
+    off = np.linalg.norm((track.positions - expected)[seen & held], axis=1)
+    weighed = np.einsum("nij,nj->ni", track.precision, np.nan_to_num(track.positions))
     grip = np.where(held, grip_sd**-2, 0.0)
-    precision = precision + grip[:, None, None] * np.eye(3)
+    precision = track.precision + grip[:, None, None] * np.eye(3)
     weighed = weighed + grip[:, None] * expected
     known = seen | held
     y = np.where(
@@ -51,16 +64,10 @@ def fused(
         loaded=jnp.asarray(field.widened(held)),
         pull=pull(before, tool, hold),
     )
-    return evidence, start
+    return Fused(evidence=evidence, start=start, slip=float(np.median(off)) if len(off) else 0.0)
 
 
 def pull(before: Float[np.ndarray, "n 3"], tool: ToolState, hold: GripHold) -> Pull:
     """The step of the tool that led to a frame."""
     length = np.linalg.norm(hold.closed_at - hold.tip, axis=1)
     return Pull(before=jnp.asarray(before), tip=jnp.asarray(tool.position), length=jnp.asarray(length))
-
-
-def slip(track: Track, hold: GripHold, tool: ToolState) -> float:
-    """How far the held particles are seen from where the tip should have taken them, in the median [m]; 0 unseen."""
-    off = np.linalg.norm((track.positions - hold.expected(tool))[track.visible & hold.held], axis=1)
-    return float(np.median(off)) if len(off) else 0.0

@@ -1,6 +1,7 @@
 """What any way of seeing hands to the filter: one frame's measurement of the particles."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,6 +29,11 @@ class Track:
         """Of a frame in which no particle was seen."""
         covariance = np.broadcast_to(UNSEEN_VARIANCE * np.eye(3), (n, 3, 3))
         return cls(positions=np.full((n, 3), np.nan), covariance=covariance, visible=np.zeros(n, bool))
+
+    @cached_property
+    def precision(self) -> Float[np.ndarray, "n 3 3"]:
+        """Inverse covariance, 0 where unseen [1/m^2]."""
+        return np.where(self.visible[:, None, None], np.linalg.inv(self.covariance), 0.0)
 
     def __post_init__(self) -> None:
         """Check the covariances."""
