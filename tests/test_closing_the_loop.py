@@ -15,6 +15,7 @@ from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.attribution.fit import fit, moved
 from jiggle_mj.estimator.attribution.gather import assumed, gather
+from jiggle_mj.estimator.attribution.scores import bayes_factor
 from jiggle_mj.estimator.attribution.sheet import closed_on, held_way
 from jiggle_mj.estimator.attribution.still_noise import measure
 from jiggle_mj.estimator.attribution.suggestion import suggest, told_apart
@@ -124,10 +125,12 @@ def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
     """Where a sheet has folded, say."""
     closed, *_ = light
     begun = closed.stages[0].fitted
-    there = iter([(begun, []), (dataclasses.replace(begun, cost=np.nan), [])])
+    folded = dataclasses.replace(begun, cost=np.nan)
+    there = iter([(begun, []), (folded, [])])
     monkeypatch.setattr(fitting, "_reckoned", lambda *_: next(there))
     monkeypatch.setattr(fitting, "_better", lambda *_: (begun.point, begun.cost - 1))
     assert fit(closed.problem, begun.named, begun.point, {1}) is begun
+    assert bayes_factor(closed.problem, folded, begun, 1) == (-np.inf, -np.inf)
 
 
 def test_all_frames_are_compiled_for_as_one(light):

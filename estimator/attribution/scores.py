@@ -73,7 +73,12 @@ def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " 
 
 
 def bayes_factor(problem: Problem, better: Fitted, plain: Fitted, sites: int) -> tuple[float, float]:
-    """By how much a fit is likelier than another, and ln BF: less what its effect at one of `sites` costs [nat]."""
+    """By how much a fit is likelier than another, and ln BF: less what its effect at one of `sites` costs [nat].
+
+    Of a fit that cannot be weighed both are minus infinity.
+    """
+    if not np.isfinite(better.cost):
+        return -np.inf, -np.inf
     likelier = min(gains_over(problem, better, plain))
     return likelier, float(likelier - (occam(problem, better)[0] - occam(problem, plain)[0]) - np.log(sites))
 
@@ -124,7 +129,7 @@ def _where_natural(problem: Problem, fitted: Fitted, score: Score) -> Score:
     best = begun[int(np.argmin(costs))]
     found = fit(problem, np.append(fitted.named, at), best, parts, passes=STEPS)
     likelier, gain = bayes_factor(problem, found, fitted, effect.sites)
-    if not gain > score.log_bayes_factor:
+    if gain <= score.log_bayes_factor:
         return score
     return replace(
         score,
