@@ -26,6 +26,8 @@ class TriangleMembrane(Term):
     """Rest area [m^2]."""
     stiffness: Float[Array, ""]
     """k [N/m]."""
+    poisson: Float[Array, ""]
+    """nu."""
     elasticity: Float[Array, "f 3 3"]
     """C [N/m]."""
     inelastic: Float[Array, "f 3"]
@@ -47,14 +49,14 @@ class TriangleMembrane(Term):
         flat = np.stack([first, second], axis=1) @ material
         inverse = np.linalg.inv(flat)
         gradient = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
-        plane = np.array([[1, poisson, 0], [poisson, 1, 0], [0, 0, (1 - poisson) / 2]]) / (1 - poisson**2)
         m = len(mesh.faces)
         return cls(
             vertices=mesh.faces,
             shape_gradient=jnp.asarray(gradient),
             area=jnp.asarray(mesh.face_area),
             stiffness=jnp.asarray(stiffness, dtype=float),
-            elasticity=jnp.asarray(np.broadcast_to(stiffness * plane, (m, 3, 3))),
+            poisson=jnp.asarray(poisson, dtype=float),
+            elasticity=jnp.broadcast_to(stiffness * plane_stress(poisson), (m, 3, 3)),
             inelastic=jnp.zeros((m, 3)),
             stiffening=jnp.zeros(()),
         )
@@ -104,6 +106,12 @@ class TriangleMembrane(Term):
         stress = _matrix(stress) if compressive else _tensile(_matrix(stress))
         geometric = jnp.einsum("fak,fkl,fbl,ij->faibj", N, stress, N, jnp.eye(3, dtype=F.dtype))
         return self.area[:, None, None, None, None] * (material + geometric)
+
+
+def plane_stress(poisson: float | Float[Array, ""]) -> Float[Array, "3 3"]:
+    """C / k of an isotropic sheet, over (E_11, E_22, 2 E_12)."""
+    one, nu = jnp.ones(()), jnp.asarray(poisson, dtype=float)
+    return jnp.diag(jnp.stack([one, one, (1 - nu) / 2])).at[0, 1].set(nu).at[1, 0].set(nu) / (1 - nu**2)
 
 
 class EdgeMembrane(Term):

@@ -27,6 +27,7 @@ DISTURBANCES: dict[str, type[Disturbance]] = {
     "inclusion": sheet.Inclusion,
     "heterogeneity": sheet.Heterogeneity,
     "anisotropy": sheet.Anisotropy,
+    "poisson": sheet.Poisson,
     "stretch": sheet.Stretch,
     "bending": sheet.Bending,
     "pre_strain": sheet.PreStrain,
@@ -62,7 +63,7 @@ DISTURBANCES: dict[str, type[Disturbance]] = {
 }
 
 
-MATERIAL = (sheet.Inclusion, sheet.Heterogeneity, sheet.Anisotropy, sheet.Stretch, sheet.Bending)
+MATERIAL = (sheet.Inclusion, sheet.Heterogeneity, sheet.Anisotropy, sheet.Poisson, sheet.Stretch, sheet.Bending)
 """Those that make the sheet another elastic sheet."""
 
 

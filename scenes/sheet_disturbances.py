@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 from jiggle_mj.scenes.disturbance import TissueDisturbance, meet_sheet
 from jiggle_mj.scenes.elements import Elements
 from jiggle_mj.scenes.section import integer, number, vector
@@ -37,6 +38,21 @@ class Stretch(TissueDisturbance):
     def begin(self, simulation: "Simulation") -> None:
         """Of all elements."""
         simulation.model.flex_stiffness[:] *= self.magnitude
+
+
+@dataclass(frozen=True, kw_only=True)
+class Poisson(TissueDisturbance):
+    """Narrows more or less than is said as it is stretched, Young's modulus and bending left alone."""
+
+    magnitude: float = number(0.2, at_least=0, below=0.5)
+    """Poisson's ratio."""
+
+    def begin(self, simulation: "Simulation") -> None:
+        """Add the difference between the two isotropic sheets' energies."""
+        elements, tissue = Elements(simulation), simulation.scene.tissue
+        change = tissue.young * tissue.thickness * (_plane_stress(self.magnitude) - _plane_stress(tissue.poisson))
+        energy = np.einsum("f,fpi,pq,fqj->fij", elements.areas, elements.strain, change, elements.strain)
+        elements.stiffness[:, :6] += elements.packed(energy)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,3 +207,8 @@ class TissueYield(TissueDisturbance):
 WAVES = 64
 NEVER = 1e3
 """A strain."""
+
+
+def _plane_stress(poisson: float) -> Float[np.ndarray, "3 3"]:
+    """Of an isotropic sheet with a Young's modulus of 1, over (E_xx, E_yy, E_xy)."""
+    return np.array([[1, poisson, 0], [poisson, 1, 0], [0, 0, 2 * (1 - poisson)]]) / (1 - poisson**2)

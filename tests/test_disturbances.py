@@ -37,6 +37,7 @@ CHANGE = {
     "inclusion=0.1": 0.90,
     "heterogeneity=0.5": 0.57,
     "anisotropy=3": 1.16,
+    "poisson=0.1": 0.39,
     "stretch=2": 0.88,
     "bending=20": 1.16,
     "pre_strain=0.03": 1.59,
@@ -84,13 +85,31 @@ def test_the_lifted_sheet_changes_by_about_what_was_measured(text):
 
 
 def test_what_says_that_nothing_changes_changes_nothing():
-    for text in ("gravity=1", "stretch=1", "bending=1", "inclusion=1", "anisotropy=0", "pre_strain=0", "bed=0"):
+    for text in (
+        "gravity=1",
+        "poisson=0.45",
+        "stretch=1",
+        "bending=1",
+        "inclusion=1",
+        "anisotropy=0",
+        "pre_strain=0",
+        "bed=0",
+    ):
         np.testing.assert_array_equal(lifted(text)[1].positions, lifted()[1].positions)
 
 
 def test_all_stiffnesses_twice_is_youngs_modulus_twice():
     stiffer = dataclasses.replace(SCENE, tissue=dataclasses.replace(SCENE.tissue, young=60e3))
     np.testing.assert_allclose(lifted("stretch=2", "bending=2")[1].positions, lifted(scene=stiffer)[1].positions)
+
+
+def test_another_poissons_ratio_is_a_tissue_of_that_ratio_that_bends_as_before():
+    other = dataclasses.replace(SCENE, tissue=dataclasses.replace(SCENE.tissue, poisson=0.1))
+    changed, declared, plain = (
+        Simulation(one, drawn=False).model for one in (disturbed(SCENE, ["poisson=0.1"]), other, SCENE)
+    )
+    np.testing.assert_allclose(changed.flex_stiffness, declared.flex_stiffness, rtol=1e-9)
+    np.testing.assert_array_equal(changed.flex_bending, plain.flex_bending)
 
 
 def test_a_raised_bed_raises_the_sheet():

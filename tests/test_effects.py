@@ -94,6 +94,14 @@ def test_the_energy_with_room_for_effects_is_the_declared_one(plain):
         np.testing.assert_allclose(plain.energy.gradient(x, b), declared, rtol=0, atol=1e-12)
 
 
+def test_another_poissons_ratio_is_the_membrane_built_with_it(plain, moment):
+    with jax.enable_x64(True):
+        k, nu = DECLARATION.membrane_stiffness, DECLARATION.poisson
+        changed = EFFECTS["poisson"].acts(plain, jnp.array([-0.2]), moment).term(TriangleMembrane)
+        built = TriangleMembrane.build(sheet(), stiffness=k, poisson=nu - 0.2)
+        np.testing.assert_allclose(changed.elasticity, built.elasticity, rtol=1e-9)
+
+
 def test_gravity_and_drag_are_their_closed_forms(plain, moment):
     with jax.enable_x64(True):
         forces = lambda model: np.asarray(model.energy.internal_gradient(moment.now))  # noqa: E731

@@ -59,6 +59,9 @@ def test_disturbances_of_the_material_show():
     plain, stated, m = stiffness(COARSE), typed(COARSE.tissue), 3.0
     assert stiffness(disturbed(COARSE, ["stretch=2"])).stretch_x == pytest.approx(2 * stated.stretch_x, rel=1e-3)
     assert stiffness(disturbed(COARSE, ["bending=20"])).bending == pytest.approx(20 * plain.bending, rel=1e-6)
+    narrower = stiffness(disturbed(COARSE, ["poisson=0.1"]))
+    assert narrower.poisson == pytest.approx(0.1, abs=1e-3)
+    assert (narrower.stretch_x, narrower.bending) == pytest.approx((stated.stretch_x, plain.bending), rel=1e-3)
     fibres = stiffness(disturbed(COARSE, [f"anisotropy={m}"]))
     nu = COARSE.tissue.poisson
     own = stated.stretch_x / (1 - nu**2) * np.array([[1, nu], [nu, 1]]) + np.diag([m * stated.stretch_x, 0.0])

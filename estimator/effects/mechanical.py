@@ -9,7 +9,7 @@ from jiggle_mj.estimator.effects.effect import Effect
 from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, tangents
 from jiggle_mj.estimator.effects.terms import Film, Load
 from jiggle_mj.estimator.environment import Bed, Weight
-from jiggle_mj.estimator.membrane import TriangleMembrane
+from jiggle_mj.estimator.membrane import TriangleMembrane, plane_stress
 
 STANDARD_GRAVITY = 9.80665
 """[m/s^2]."""
@@ -57,6 +57,13 @@ def _bed(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetM
 
 def _stretch(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
     return _stiffer(model, jnp.exp(theta[0]))
+
+
+def _poisson(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+    """By how much the sheet narrows as it is stretched; Young's modulus stays."""
+    membrane = model.term(TriangleMembrane)
+    change = membrane.stiffness * (plane_stress(membrane.poisson + theta[0]) - plane_stress(membrane.poisson))
+    return model.with_term(eqx.tree_at(lambda t: t.elasticity, membrane, membrane.elasticity + change[None]))
 
 
 def _bending(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
@@ -147,6 +154,14 @@ MECHANICAL = (
         confounded_with=("gravity", "camera_bias", "attachments"),
     ),
     Effect(
+        name="poisson",
+        acts=_poisson,
+        units=("",),
+        prior_sd=(0.15,),
+        source="muscle across its fibres 0.36 and 0.65, rubber almost 0.5",
+        confounded_with=("anisotropy", "stretch"),
+    ),
+    Effect(
         name="stretch",
         acts=_stretch,
         units=("log factor",),
@@ -186,7 +201,7 @@ MECHANICAL = (
         prior_sd=(1.0,),
         sites=ANGLES,
         source="skin along and across Langer's lines",
-        confounded_with=("heterogeneity", "pre_strain"),
+        confounded_with=("heterogeneity", "pre_strain", "poisson"),
     ),
     Effect(
         name="pre_strain",
