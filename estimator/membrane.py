@@ -110,8 +110,7 @@ class TriangleMembrane(Term):
 
 def plane_stress(poisson: float | Float[Array, ""]) -> Float[Array, "3 3"]:
     """C / k of an isotropic sheet, over (E_11, E_22, 2 E_12)."""
-    one, nu = jnp.ones(()), jnp.asarray(poisson, dtype=float)
-    return jnp.diag(jnp.stack([one, one, (1 - nu) / 2])).at[0, 1].set(nu).at[1, 0].set(nu) / (1 - nu**2)
+    return jnp.array([[1, poisson, 0], [poisson, 1, 0], [0, 0, (1 - poisson) / 2]]) / (1 - poisson**2)
 
 
 class EdgeMembrane(Term):

@@ -30,22 +30,16 @@ class Elements:
         self.stiffness: Float[np.ndarray, "f 21"] = model.flex_stiffness.reshape(len(corners), -1)
         """K [N/m^3]."""
         x, y = np.moveaxis(place[model.flex_edge[self._edges, 1]] - place[model.flex_edge[self._edges, 0]], 2, 0)
-        self.strain: Float[np.ndarray, "f 3 3"] = np.linalg.inv(2 * np.stack([x**2, y**2, 2 * x * y], axis=2))
-        """What the Green strain (E_xx, E_yy, E_xy) is, per s [1/m^2]."""
+        self._strain = np.linalg.inv(2 * np.stack([x**2, y**2, 2 * x * y], axis=2))
 
-    def strain_along(self, direction_deg: float) -> Float[np.ndarray, "f 3"]:
-        """What the Green strain along a direction is, per s [1/m^2]."""
-        turn = np.radians(direction_deg)
-        c, s = np.cos(turn), np.sin(turn)
-        return np.array([c**2, s**2, 2 * c * s]) @ self.strain
-
-    def packed(self, matrix: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 6"]:
-        """K of an energy 1/2 s^T matrix s."""
+    def add(self, elasticity: Float[np.ndarray, "3 3"]) -> None:
+        """Add a membrane that stores E^T C E / 2 an area, C [N/m] over the Green strain (E_xx, E_yy, E_xy)."""
+        energy = np.einsum("f,fpi,pq,fqj->fij", self.areas, self._strain, elasticity, self._strain)
         row, column = np.triu_indices(3)
-        return 2 * matrix[:, row, column]
+        self.stiffness[:, :6] += 2 * energy[:, row, column]
 
     def squared_strain(self) -> Float[np.ndarray, " f"]:
         """Of the Green strain, its squared Frobenius norm."""
         s = self._data.flexedge_length[self._edges] ** 2 - self._model.flexedge_length0[self._edges] ** 2
-        xx, yy, xy = np.einsum("fij,fj->if", self.strain, s)
+        xx, yy, xy = np.einsum("fij,fj->if", self._strain, s)
         return xx**2 + yy**2 + 2 * xy**2

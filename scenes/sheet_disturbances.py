@@ -49,10 +49,9 @@ class Poisson(TissueDisturbance):
 
     def begin(self, simulation: "Simulation") -> None:
         """Add the difference between the two isotropic sheets' energies."""
-        elements, tissue = Elements(simulation), simulation.scene.tissue
-        change = tissue.young * tissue.thickness * (_plane_stress(self.magnitude) - _plane_stress(tissue.poisson))
-        energy = np.einsum("f,fpi,pq,fqj->fij", elements.areas, elements.strain, change, elements.strain)
-        elements.stiffness[:, :6] += elements.packed(energy)
+        tissue = simulation.scene.tissue
+        change = _plane_stress(self.magnitude) - _plane_stress(tissue.poisson)
+        Elements(simulation).add(tissue.young * tissue.thickness * change)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,10 +119,10 @@ class Anisotropy(TissueDisturbance):
 
     def begin(self, simulation: "Simulation") -> None:
         """Add the energy of the strain along them, E t m / 2 an area."""
-        elements, tissue = Elements(simulation), simulation.scene.tissue
-        along = elements.strain_along(self.direction_deg)
-        stiff = self.magnitude * tissue.young * tissue.thickness * elements.areas
-        elements.stiffness[:, :6] += elements.packed(stiff[:, None, None] * along[:, :, None] * along[:, None, :])
+        tissue, turn = simulation.scene.tissue, math.radians(self.direction_deg)
+        c, s = math.cos(turn), math.sin(turn)
+        along = np.array([c**2, s**2, 2 * c * s])
+        Elements(simulation).add(self.magnitude * tissue.young * tissue.thickness * np.outer(along, along))
 
 
 @dataclass(frozen=True, kw_only=True)

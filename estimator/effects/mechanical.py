@@ -63,7 +63,7 @@ def _poisson(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> Sh
     """By how much the sheet narrows as it is stretched; Young's modulus stays."""
     membrane = model.term(TriangleMembrane)
     change = membrane.stiffness * (plane_stress(membrane.poisson + theta[0]) - plane_stress(membrane.poisson))
-    return model.with_term(eqx.tree_at(lambda t: t.elasticity, membrane, membrane.elasticity + change[None]))
+    return _with_elasticity(model, membrane.elasticity + change[None])
 
 
 def _bending(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
@@ -86,7 +86,7 @@ def _anisotropy(model: SheetModel, theta: Float[Array, " angles"], moment: Momen
     membrane, angle = model.term(TriangleMembrane), jnp.asarray(np.pi * np.arange(ANGLES) / ANGLES)
     along = jnp.stack([jnp.cos(angle) ** 2, jnp.sin(angle) ** 2, jnp.cos(angle) * jnp.sin(angle)], axis=1)
     fibres = membrane.stiffness * jnp.einsum("a,ap,aq->pq", theta, along, along)
-    return model.with_term(eqx.tree_at(lambda t: t.elasticity, membrane, membrane.elasticity + fibres[None]))
+    return _with_elasticity(model, membrane.elasticity + fibres[None])
 
 
 def _pre_strain(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
@@ -120,8 +120,11 @@ def _adhesion(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> S
 
 
 def _stiffer(model: SheetModel, times: Float[Array, "*f"]) -> SheetModel:
-    membrane = model.term(TriangleMembrane)
-    return model.with_term(eqx.tree_at(lambda t: t.elasticity, membrane, times * membrane.elasticity))
+    return _with_elasticity(model, times * model.term(TriangleMembrane).elasticity)
+
+
+def _with_elasticity(model: SheetModel, elasticity: Float[Array, "f 3 3"]) -> SheetModel:
+    return model.with_term(eqx.tree_at(lambda t: t.elasticity, model.term(TriangleMembrane), elasticity))
 
 
 def _places(model: SheetModel, moment: Moment) -> Float[Array, "f 2"]:
