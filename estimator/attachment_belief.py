@@ -134,11 +134,22 @@ class AttachmentBelief(eqx.Module):
         The chain begins at what is believed. The sites are those that give s the samples' mean and, as nearly as sites
         can, variance; the messages those that give the samples' P(attached).
         """
-        mixture, _ = self._mixture(*self._cavity(self.gaussian()))
-        state = jnp.where(mixture.attached > 0.5, 1 + jnp.argmax(mixture.weight[1:], axis=0), 0)
-        sampler = Sampler(prior=self.prior, precision=self.precision, shift=self.shift)
+        sampler, state = self._sampler
         found = sampler.run(state, key, burn_in=burn_in, rounds=rounds, doublings=doublings)
         return self._saying(found), found.agree
+
+    def mode(self, key: PRNGKeyArray) -> Float[Array, " n"]:
+        """S of attachments that are likeliest together, near those that are likelier than not; see `Sampler.mode`."""
+        sampler, begun = self._sampler
+        state, mean = sampler.mode(begun, key)
+        return jnp.where(state > 0, jnp.clip(mean, 0, RIGID), 0.0)
+
+    @property
+    def _sampler(self) -> tuple[Sampler, Int[Array, " n"]]:
+        """What draws from the posterior, and the states that are likeliest one by one."""
+        mixture, _ = self._mixture(*self._cavity(self.gaussian()))
+        state = jnp.where(mixture.attached > 0.5, 1 + jnp.argmax(mixture.weight[1:], axis=0), 0)
+        return Sampler(prior=self.prior, precision=self.precision, shift=self.shift), state
 
     def _saying(self, found: Sampled) -> "AttachmentBelief":
         """Sites and messages that give what was sampled."""

@@ -47,21 +47,27 @@ def sampled(load: float, rounds: int = ROUNDS, doublings: int = 1, even: float =
     )
 
 
-def summed(load: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Probabilities of all states of each particle, whose attached s are above 0; mean and variance of s without."""
+def given(load: float, state: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Log probability of a state, whose attached s are above 0, up to a constant; mean and covariance of s without."""
     stiffness, (precision, shift) = prior().stiffness, seen(load)
     centre, narrow = np.asarray(stiffness.mean), np.asarray(stiffness.sd) ** -2.0
+    T, attached = np.diag(narrow[state]), np.minimum(state, 1)
+    covariance = np.linalg.inv(precision + T)
+    at = covariance @ (shift + T @ centre[state])
+    log = attached @ np.full(N, logit(PROBABILITY) + np.log(0.5)) + COUPLING * (attached[1:] @ attached[:-1])
+    log += 0.5 * (np.linalg.slogdet(T)[1] + np.linalg.slogdet(covariance)[1])
+    log += 0.5 * (at @ np.linalg.solve(covariance, at) - centre[state] @ T @ centre[state])
+    if (of := np.flatnonzero(attached)).size:
+        log += np.log(multivariate_normal(cov=covariance[np.ix_(of, of)]).cdf(at[of]))
+    return float(log), at, covariance
+
+
+def summed(load: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Probabilities of all states of each particle; mean and variance of s."""
     total, weight, mean, squared = 0.0, np.zeros((3, N)), np.zeros(N), np.zeros(N)
     for each in product(range(3), repeat=N):
         state = np.array(each)
-        T, attached = np.diag(narrow[state]), np.minimum(state, 1)
-        covariance = np.linalg.inv(precision + T)
-        at = covariance @ (shift + T @ centre[state])
-        log = attached @ np.full(N, logit(PROBABILITY) + np.log(0.5)) + COUPLING * (attached[1:] @ attached[:-1])
-        log += 0.5 * (np.linalg.slogdet(T)[1] + np.linalg.slogdet(covariance)[1])
-        log += 0.5 * (at @ np.linalg.solve(covariance, at) - centre[state] @ T @ centre[state])
-        if (of := np.flatnonzero(attached)).size:
-            log += np.log(multivariate_normal(cov=covariance[np.ix_(of, of)]).cdf(at[of]))
+        log, at, covariance = given(load, state)
         total += (p := np.exp(log))
         weight += p * (state == np.arange(3)[:, None])
         mean, squared = mean + p * at, squared + p * (at**2 + np.diag(covariance))
@@ -77,6 +83,17 @@ def test_samples_are_those_of_the_posterior(load):
     np.testing.assert_allclose(found.mean, mean, atol=0.05 * np.sqrt(variance).max())
     np.testing.assert_allclose(found.variance, variance, rtol=0.15)
     assert found.agree
+
+
+@pytest.mark.parametrize("load", [0.0, 0.03, 0.3])
+def test_in_a_mode_no_particle_is_likelier_otherwise_and_a_load_is_carried(load):
+    """By the first or by the second, where the odds of each may be even; there is nothing else to choose from."""
+    state, mean = eqx.filter_jit(sampler(load).mode)(jnp.zeros(N, int), jax.random.key(0))
+    found = np.asarray(state)
+    for i, other in product(range(N), range(3)):
+        assert given(load, np.where(np.arange(N) == i, other, found))[0] <= given(load, found)[0] + 1e-9
+    np.testing.assert_allclose(mean, given(load, found)[1], rtol=1e-9, atol=1e-12)
+    assert np.minimum(found[:2], 1).sum() == (load > 0)
 
 
 def test_a_chain_that_has_not_seen_enough_says_so_or_goes_on():

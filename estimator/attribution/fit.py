@@ -2,7 +2,7 @@
 
 Gauss-Newton with the weights of the state at hand [iteratively reweighted: Green 1984, JRSS B 46:149]: a step is taken
 if it lessens the misfit under the weights that it was reckoned with, so that nothing is won by weights that forgive
-more. Stiffnesses go where samples of the belief say.
+more. Stiffnesses go where the belief says.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from jiggle_mj.estimator.attribution.linear import Glance, Metric
 from jiggle_mj.estimator.attribution.normal_equations import reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
-from jiggle_mj.estimator.filters.implicit import reconsidered
+from jiggle_mj.estimator.filters.implicit import likeliest, reconsidered
 
 ODDS = 2.2
 """What an attachment costs: the logarithm of nine to one [nat]."""
@@ -94,11 +94,15 @@ def fit(
 
 
 def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
-    """One more step from the end of a fit, with the frames of one part left out, by what is known there already."""
+    """One more step from the end of a fit, with the frames of one part left out, by what is known there already.
+
+    Not to the attachments likeliest together: of many that are as likely, they are some, and fewer frames would take
+    others at random.
+    """
     left = [k for k in fitted.glances if problem.history.frames[k].part != part]
     glances, weights = {k: fitted.glances[k] for k in left}, {k: fitted.weights[k] for k in left}
     now, steps = _found(problem, fitted.named, fitted.point, glances, weights)
-    better = _better(problem, now, steps, least=0.0)
+    better = _better(problem, now, steps[:2], least=0.0)
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
 
@@ -177,9 +181,10 @@ def _promised(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: 
 def _steps(
     problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray
 ) -> tuple[list[Step], Float[np.ndarray, " n"]]:
-    """To the s that samples of the belief find, and at the s at hand: each with the parameters that fit it best.
+    """To the s that samples find attached one by one, at the s at hand, and to those likeliest together.
 
-    And the belief's sites.
+    Each with the parameters that fit it best; and the belief's sites. Where any of many may carry a load, none of them
+    is likelier attached than not, and yet one must be.
     """
     n, d = len(point.s), len(free)
     A = square[n : n + d, n : n + d] + np.diag(sd**-2)
@@ -190,13 +195,14 @@ def _steps(
     stated = reconsidered(problem.prior.add(jnp.asarray(L), jnp.asarray(shift)))
     s = np.asarray(problem.prior.bounded(jnp.where(stated.probability > 0.5, stated.b, 0.0)))
     assert isinstance(stated.belief, AttachmentBelief)
+    together = np.asarray(likeliest(stated.belief))
 
     def step(to: Float[np.ndarray, " n"]) -> Step:
         theta = np.zeros(len(point.theta))
         theta[free] = np.clip(-np.linalg.solve(A, gt + C.T @ (to - point.s)), -FAR * sd, FAR * sd)
         return theta, to - point.s
 
-    return [step(s), step(point.s)], np.asarray(stated.belief.site_precision)
+    return [step(s), step(point.s), step(together)], np.asarray(stated.belief.site_precision)
 
 
 def _cost(problem: Problem, weights: dict[int, Metric], point: Point, named: np.ndarray) -> float:

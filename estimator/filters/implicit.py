@@ -172,6 +172,12 @@ def reconsidered(belief: AttachmentBelief) -> Stated:
     return _sampled(belief, PASSING)
 
 
+@eqx.filter_jit
+def likeliest(belief: AttachmentBelief) -> Float[Array, " n"]:
+    """S of the attachments that are likeliest together."""
+    return belief.mode(jax.random.key(0))
+
+
 class _Grasp:
     """The frames between closing and opening the jaws, and what they say together."""
 
