@@ -6,11 +6,13 @@ goes perception -> grip -> filter. Sees nothing but observations, the camera's c
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from jiggle_mj.estimator import stating
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief import BoundaryBelief
 from jiggle_mj.estimator.blas import one_thread
@@ -36,8 +38,6 @@ from jiggle_mj.mesh_checks import check_unfolded
 from jiggle_mj.observation import Cut, Declaration, Observation, Suture, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
-RULE = "P(attached) > 0.5"
-"""Of filters that state a probability."""
 SEEN = 3e-4
 """Standard deviation of a seen coordinate before the first frame has said how well it is seen [m]."""
 
@@ -164,17 +164,7 @@ class Estimator:
         """
         self._check_begun()
         with jax.enable_x64(True), one_thread():
-            mean, covariance = self._belief.moments()
-            if isinstance(self._belief, BoundaryBelief):
-                return Belief(mean=np.asarray(mean), covariance=np.asarray(covariance))
-            lower, upper = self._belief.interval()
-            return Belief(
-                mean=np.asarray(mean),
-                covariance=np.asarray(covariance),
-                reference=float(self._belief.reference),
-                lower=np.asarray(lower),
-                upper=np.asarray(upper),
-            )
+            return stating.belief(self._stated)
 
     @property
     def detection(self) -> Detection:
@@ -185,27 +175,7 @@ class Estimator:
         """
         self._check_begun()
         assert self._filter is not None
-        if np.isfinite(self._probability).all():
-            noise = self._filter.noise
-            return Detection(
-                attached=self._probability > 0.5,
-                score=self._probability,
-                stiffness=self._b,
-                stiffness_sd=self._sd,
-                probabilistic=True,
-                rule=RULE,
-                converged=self._converged,
-                force_sd_ratio=None if noise is None else noise.force**0.5,
-                position_sd_ratio=None if noise is None else noise.position**0.5,
-            )
-        limit = self.config.detect_above * self.declaration.membrane_stiffness
-        return Detection(
-            attached=self._b > limit,
-            score=self._b,
-            stiffness=self._b,
-            stiffness_sd=self._sd,
-            rule=f"non-negative mean of b > {self.config.detect_above:g} k = {limit:.3g} N/m",
-        )
+        return stating.detection(self._stated, self._filter, self.declaration, self.config, converged=self._converged)
 
     def update(self, observation: Observation) -> Estimate | None:
         """Take one observation; None when it only helps to fix the rest shape, or cannot be used.
@@ -242,7 +212,7 @@ class Estimator:
             return
         thorough = at_the_end or self.config.judging == "grasps"
         with jax.enable_x64(True), one_thread():
-            if (again := self._filter.release(self._belief, thorough=thorough)) is not None:
+            if (again := self._filter.release(self._stated.belief, thorough=thorough)) is not None:
                 self._judge(again)
 
     def identify(self, *, on_pass: Callable[[dict[str, float]], None] = lambda _: None) -> Material:
@@ -259,7 +229,7 @@ class Estimator:
         self.release()
         implicit, belief = self._implicit("can identify the sheet")
         with jax.enable_x64(True), one_thread():
-            factors, log_sd, stated, converged = identify(implicit, belief, jnp.asarray(self._b), on_pass=on_pass)
+            factors, log_sd, stated, converged = identify(implicit, belief, self._stated.b, on_pass=on_pass)
             self._judge(stated)
         return material(self.declaration, factors, log_sd, converged=converged)
 
@@ -291,7 +261,7 @@ class Estimator:
         hold, before = self._grip(track, tool)
         frame = fused(track, hold, tool, before, grip_sd=self.config.grip_sd, field=self._field)
         self._slip, self._sharpness = frame.slip, track.precision[track.visible].mean(axis=0)
-        update = self._filter.update(self._belief, jnp.asarray(self._b), frame.evidence, jnp.asarray(frame.start))
+        update = self._filter.update(self._stated.belief, self._stated.b, frame.evidence, jnp.asarray(frame.start))
         if not (np.isfinite(update.x).all() and np.isfinite(update.b).all()):
             raise PerceptionError(
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
@@ -299,19 +269,19 @@ class Estimator:
         self._hold, self._x = hold, np.asarray(update.x)
         again = self._filter.reconsider(update.belief) if self.config.judging == "frames" else None
         stated = again or update
-        self._believe(stated)
+        self._stated, b = stated, np.asarray(stated.b)
         return Estimate(
             index=observation.index,
             time=observation.time,
             positions=self._x,
             observed=track.positions,
-            mean=self._b,
-            sd=self._sd,
-            probability=self._probability,
+            mean=b,
+            sd=np.asarray(stated.sd),
+            probability=np.asarray(stated.probability),
             held=hold.held,
             entropy=float(stated.entropy),
             nis=float(update.nis),
-            boundary_energy=0.5 * float(np.mean(self._b * np.sum((self._x - self.sheet.rest) ** 2, axis=1))),
+            boundary_energy=0.5 * float(np.mean(b * np.sum((self._x - self.sheet.rest) ** 2, axis=1))),
             update_s=time.perf_counter() - seen,
             perception_s=seen - began,
             converged=bool(update.converged),
@@ -325,18 +295,19 @@ class Estimator:
             return
         self._release()
         assert self._filter is not None
-        if isinstance(self._belief, AttachmentBelief) and isinstance(self._filter, ImplicitFilter):
+        belief = self._stated.belief
+        if isinstance(belief, AttachmentBelief) and isinstance(self._filter, ImplicitFilter):
             if self.changes:
                 self.changes[-1].evidence = self._filter.evidence()
-            self.changes.append(Change(event=event, index=index, region=region, before=self._belief))
-            self._believe(self._filter.restart(after(self._belief, event, region)))
+            self.changes.append(Change(event=event, index=index, region=region, before=belief))
+            self._stated = self._filter.restart(after(belief, event, region))
             return
-        assert isinstance(self._belief, BoundaryBelief)
+        assert isinstance(belief, BoundaryBelief)
         meant = meant_by(event)
-        change = jnp.where(region, meant - self._belief.mean(), 0.0)
+        change = jnp.where(region, meant - belief.mean(), 0.0)
         sd = max(self.config.prior_sd * self.declaration.membrane_stiffness, meant)
-        self._belief = self._belief.predict(change, jnp.where(region, sd**2, 0.0))
-        self._b = np.asarray(self._belief.non_negative_mean())
+        belief = belief.predict(change, jnp.where(region, sd**2, 0.0))
+        self._stated = replace(self._stated, belief=belief, b=belief.non_negative_mean())
         self._filter.forget()
 
     def worked(self, change: Change) -> float | None:
@@ -349,10 +320,6 @@ class Estimator:
             evidence = change.evidence if change is not self.changes[-1] else implicit.evidence()
             return None if evidence is None else change.log_bayes_factor(*evidence)
 
-    def _believe(self, stated: Stated) -> None:
-        self._belief, self._b, self._sd = stated.belief, np.asarray(stated.b), np.asarray(stated.sd)
-        self._probability = np.asarray(stated.probability)
-
     def _judge(self, stated: Stated) -> None:
         """Believe what all frames together say."""
         if not all(np.isfinite(part).all() for part in (stated.b, stated.sd, stated.probability)):
@@ -360,13 +327,12 @@ class Estimator:
                 "judged again, the frames of all grasps leave no finite belief: no attachments explain them together. "
                 "What was believed before stays; leave out grasps to find the one that does not fit."
             )
-        self._believe(stated)
-        self._converged = bool(stated.converged)
+        self._stated, self._converged = stated, bool(stated.converged)
 
     def _implicit(self, does: str) -> tuple[ImplicitFilter, AttachmentBelief]:
         """What only the filter 'implicit' does is done with these."""
-        if isinstance(self._filter, ImplicitFilter) and isinstance(self._belief, AttachmentBelief):
-            return self._filter, self._belief
+        if isinstance(self._filter, ImplicitFilter) and isinstance(self._stated.belief, AttachmentBelief):
+            return self._filter, self._stated.belief
         raise ValueError(f"only the filter 'implicit' {does}; this one is {self.config.filter!r}.")
 
     def _check_begun(self) -> None:
@@ -379,11 +345,18 @@ class Estimator:
         mesh, plane = SheetMesh(sheet.rest, sheet.faces), SheetPlane.through(sheet.rest)
         check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
         self._field = MeshField(plane.flatten(mesh.rest), mesh.faces)
-        found, self._belief = build_filter(mesh, self.declaration, self.config)
-        self.prior_entropy = float(self._belief.entropy())
+        found, belief = build_filter(mesh, self.declaration, self.config)
+        entropy, unknown = belief.entropy(), jnp.full(mesh.n, jnp.nan)
+        self.prior_entropy = float(entropy)
+        self._stated = Stated(
+            belief=belief,
+            b=jnp.zeros(mesh.n),
+            sd=unknown,
+            probability=unknown,
+            entropy=entropy,
+            converged=jnp.asarray(True),
+        )
         self._x = self._lying = mesh.rest
-        self._b = np.zeros(mesh.n)
-        self._sd = self._probability = np.full(mesh.n, np.nan)
         return found
 
     def _see(self, observation: Observation) -> Track:
@@ -394,7 +367,7 @@ class Estimator:
         hold, before = self._grip(Track.of_nothing(len(self._x)), tool)
         stiffness = jnp.where(hold.held, self.config.grip_stiffness * self.declaration.membrane_stiffness, 0.0)
         moved = pull(before, tool, hold)
-        return before, self._b, Grip.of(moved.tip, moved.length, stiffness)
+        return before, np.asarray(self._stated.b), Grip.of(moved.tip, moved.length, stiffness)
 
     def _lies(self, observation: Observation) -> Float[np.ndarray, "n 3"]:
         """Where the sheet lies with the jaws open; what is not seen moves with its surroundings."""

@@ -81,7 +81,7 @@ def close_loop(
             raise RecordingError(f"{truth} is not the truth of {recording_path}.")
         last = gathered.frames[-1].index
         for when, fitted in (("before", closed.stages[0].fitted), ("after", closed.final)):
-            found[f"detection_{when}"] = _scored(sheet, fitted.point.s > 0, true, last)
+            found[f"detection_{when}"] = _scored(sheet, fitted.attached, true, last)
     name = recording.metadata.get("name", recording_path.stem)
     (directory / DISCREPANCY).write_text(json.dumps(found, indent=1) + "\n")
     write_page(directory / PAGE, name=name, sheet=sheet, found=found)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from jiggle_mj.estimator.estimator import RULE
+from jiggle_mj.estimator.stating import RULE
 from jiggle_mj.scenes import DISTURBANCES, load_scene, shipped_scenes
 from jiggle_mj.scenes.attachments import SHAPES, Attachment
 from jiggle_mj.scenes.scene import Scene

@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.attribution.every_frame import cost_under, directions, linearised, weighed
 from jiggle_mj.estimator.attribution.linear import Glance, Metric
 from jiggle_mj.estimator.attribution.normal_equations import reduced
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import predict_all
+from jiggle_mj.estimator.filters.evidence import Stated
 from jiggle_mj.estimator.filters.implicit import likeliest, reconsidered
 
 ODDS = 2.2
@@ -53,8 +54,15 @@ class Fitted:
     """By frame."""
     site_precision: Float[np.ndarray, " n"]
     """How sure the belief is of each s besides what frames say."""
+    probability: Float[np.ndarray, " n"]
+    """P(attached) of each. Of attachments that are likeliest together none need be likely by itself."""
     cost: float
     """Twice the negative logarithm of likelihood and prior under its own weights [nat]."""
+
+    @property
+    def attached(self) -> Bool[np.ndarray, " n"]:
+        """What is likelier attached than not."""
+        return self.probability > 0.5
 
 
 def start(problem: Problem, theta: np.ndarray, s: np.ndarray, states: np.ndarray, frames: list[int]) -> Point:
@@ -128,7 +136,8 @@ def _found(
 ) -> tuple[Fitted, list[Step]]:
     free, sd = problem.free(named), problem.sd(named)
     square = reduced(problem, glances, len(free))
-    steps, sites = _steps(problem, square, point, free, sd)
+    steps, stated = _steps(problem, square, point, free, sd)
+    assert isinstance(stated.belief, AttachmentBelief)
     found = Fitted(
         point=point,
         named=named,
@@ -136,7 +145,8 @@ def _found(
         square=square,
         glances=glances,
         weights=weights,
-        site_precision=sites,
+        site_precision=np.asarray(stated.belief.site_precision),
+        probability=np.asarray(stated.probability),
         cost=_cost(problem, weights, point, named),
     )
     return found, steps
@@ -180,11 +190,11 @@ def _promised(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: 
 
 def _steps(
     problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray
-) -> tuple[list[Step], Float[np.ndarray, " n"]]:
+) -> tuple[list[Step], Stated]:
     """To the s that samples find attached one by one, at the s at hand, and to those likeliest together.
 
-    Each with the parameters that fit it best; and the belief's sites. Where any of many may carry a load, none of them
-    is likelier attached than not, and yet one must be.
+    Each with the parameters that fit it best; and what the belief states. Where any of many may carry a load, none of
+    them is likelier attached than not, and yet one must be.
     """
     n, d = len(point.s), len(free)
     A = square[n : n + d, n : n + d] + np.diag(sd**-2)
@@ -202,7 +212,7 @@ def _steps(
         theta[free] = np.clip(-np.linalg.solve(A, gt + C.T @ (to - point.s)), -FAR * sd, FAR * sd)
         return theta, to - point.s
 
-    return [step(s), step(point.s), step(together)], np.asarray(stated.belief.site_precision)
+    return [step(s), step(point.s), step(together)], stated
 
 
 def _cost(problem: Problem, weights: dict[int, Metric], point: Point, named: np.ndarray) -> float:

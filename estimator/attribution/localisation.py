@@ -14,8 +14,8 @@ def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
 
     Returns:
         frames: index, grasp, time [s], rms [m]; particles: rest [m] and mean off, seen less predicted [m], null where
-        never seen, and whether the fit has them attached; goes_with: Spearman's correlation of |off| over frames and
-        particles with each regressor.
+        never seen, P(attached) and whether that is more than a half; goes_with: Spearman's correlation of |off| over
+        frames and particles with each regressor.
     """
     frames, rest = list(fitted.glances), np.asarray(problem.history.rest)
     off = np.full((len(frames), len(rest), 3), np.nan)
@@ -40,7 +40,8 @@ def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
         "particles": {
             "rest_m": rest.tolist(),
             "mean_off_m": [one.tolist() if known else None for one, known in zip(mean, ever, strict=True)],
-            "attached": (fitted.point.s > 0).tolist(),
+            "p_attached": fitted.probability.tolist(),
+            "attached": fitted.attached.tolist(),
         },
         "goes_with": {
             name: _rank_correlation(distance, values) for name, values in _regressors(problem, fitted, frames).items()
