@@ -13,7 +13,7 @@ from jiggle_mj.estimator.attribution import fit as fitting
 from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
 from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
-from jiggle_mj.estimator.attribution.fit import fit, moved
+from jiggle_mj.estimator.attribution.fit import doubted, fit, moved
 from jiggle_mj.estimator.attribution.gather import assumed, gather
 from jiggle_mj.estimator.attribution.scores import bayes_factor
 from jiggle_mj.estimator.attribution.sheet import closed_on, held_way
@@ -131,6 +131,15 @@ def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
     monkeypatch.setattr(fitting, "_better", lambda *_: (begun.point, begun.cost - 1))
     assert fit(closed.problem, begun.named, begun.point, {1}) is begun
     assert bayes_factor(closed.problem, folded, begun, 1) == (-np.inf, -np.inf)
+
+
+def test_frames_that_are_doubted_say_less_of_the_attachments(light):
+    closed, *_ = light
+    fitted = closed.stages[-1].fitted
+    with jax.enable_x64(True), one_thread():
+        same, nothing = (doubted(closed.problem, fitted, excess) for excess in (1.0, 1e9))
+    np.testing.assert_array_equal(same.probability, fitted.probability)
+    assert fitted.attached.any() and not nothing.attached.any()
 
 
 def test_all_frames_are_compiled_for_as_one(light):
@@ -320,4 +329,4 @@ def _sheet(closed):
 
 def test_attached_particles_stay_found(light):
     closed = light[0]
-    assert np.sum((closed.stages[-1].fitted.point.s > 0) != attached()) <= 2
+    assert np.sum(closed.stages[-1].fitted.attached != attached()) <= 2

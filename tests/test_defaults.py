@@ -55,5 +55,6 @@ def test_a_disc_of_one_newton_a_metre_is_found(seed):
     assert min(exact.pcd, exact.pug) >= 0.8
 
 
+@pytest.mark.slow
 def test_a_free_sheet_has_no_attachment():
     assert not estimated(0.0, 0).detection.attached.any()

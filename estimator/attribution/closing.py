@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, fit, start
+from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, doubted, fit, start
 from jiggle_mj.estimator.attribution.gather import Gathered
 from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
 from jiggle_mj.estimator.attribution.leftover import leftover
@@ -39,8 +39,8 @@ class Closed:
     stages: list[Stage]
     """The first with what is declared alone."""
     final: Fitted
-    """The last stage's fit; where something is left over, again with force errors and fields as large as that takes, so
-    that less is called attached for a cause that has no name."""
+    """The last stage's fit; where something is left over, doubted as much as its parts are missed by fits without them,
+    so that less is called attached for a cause that has no name."""
     reported: tuple[Foretold, Foretold] | None
     """A part that chose no effect, foretold before and after; None if there was none to spare."""
     problem: Problem
@@ -89,12 +89,14 @@ def close_the_loop(
     if spare is not None:
         before = foretell(problem, stages[0].fitted, spare)
         reported = before, foretell(problem, stages[-1].fitted, spare) if accepted else before
-    verdict, last = _verdict(accepted, rivals, stages[-1], reported), stages[-1]
-    final = last.fitted
-    if verdict in LEFT_OVER:
-        say("fitting again with larger errors, for what is left over")
-        wider = problem.widened(last.left.variance, last.left.amplitude * problem.amplitude)
-        final = fit(wider, final.named, final.point, used)
+    last = stages[-1]
+    missed = ([Foretold.together(last.folds)] if last.folds else []) + ([] if reported is None else [reported[1]])
+    left_over = last.left.gain > REMAINDER or any(one.excess > EXCESS for one in missed)
+    verdict, final = _verdict(accepted, rivals, left_over), last.fitted
+    if verdict in LEFT_OVER and last.folds:
+        doubt = max(Foretold.together(last.folds).excess, 1.0)
+        say(f"what frames say counts {doubt:.1f} times less, as each of the parts is missed by that without it")
+        final = doubted(problem, final, doubt)
     return Closed(
         verdict=verdict,
         accepted=accepted,
@@ -119,12 +121,7 @@ def _declared(problem: Problem, gathered: Gathered, used: set[int], say: Callabl
     return Stage(fitted=fitted, left=leftover(problem, fitted), folds=folds, scores=[])
 
 
-def _verdict(
-    accepted: list[Trial], rivals: list[list[Trial]], last: Stage, reported: tuple[Foretold, Foretold] | None
-) -> str:
-    missed = [Foretold.together(last.folds)] if last.folds else []
-    missed += [] if reported is None else [reported[1]]
-    left_over = last.left.gain > REMAINDER or any(one.excess > EXCESS for one in missed)
+def _verdict(accepted: list[Trial], rivals: list[list[Trial]], left_over: bool) -> str:
     if not accepted:
         return "unexplained" if left_over else "no-effect"
     if left_over:

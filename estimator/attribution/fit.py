@@ -114,6 +114,15 @@ def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
 
+def doubted(problem: Problem, fitted: Fitted, excess: float) -> Fitted:
+    """A fit as it is believed where what it never saw is missed by `excess` times the stated variance.
+
+    All that its frames say counts by as much less: quasi-likelihood [Wedderburn 1974, doi:10.1093/biomet/61.3.439].
+    """
+    _, stated = _steps(problem, fitted.square / excess, fitted.point, fitted.free, problem.sd(fitted.named))
+    return replace(fitted, probability=np.asarray(stated.probability))
+
+
 def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
     """By how much one fit explains the frames better than another, under its own weights and under the other's [nat].
 
