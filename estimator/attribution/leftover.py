@@ -57,7 +57,7 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
     best = max(likelihoods, key=lambda key: likelihoods[key])
     gain = likelihoods[best] - likelihoods[1.0, 1.0]
     tool, gain_of_tool = _of_tool(problem, fitted)
-    return Leftover(gain=gain + gain_of_tool, variance=best[0], amplitude=best[1], tool_variance=tool)
+    return Leftover(gain=float(gain + gain_of_tool), variance=best[0], amplitude=best[1], tool_variance=tool)
 
 
 def _of_tool(problem: Problem, fitted: Fitted) -> tuple[float, float]:
