@@ -122,7 +122,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         subplot_titles=(
             "mean miss on the sheet, before [mm]; ringed: found attached",
             "after [mm]",
-            "log Bayes factor of each effect, one step from the fit [nat]",
+            "log Bayes factor, one step from the fit [nat]",
             "what the miss goes with (rank correlation), before and after",
             "miss of each fitted frame [mm]",
             "parts left out of the fit, then one that chose no effect [mm]",
