@@ -108,7 +108,7 @@ class Sampler(eqx.Module):
         share = self.prior.stiffness.share
 
         def sweep(carried):
-            before, moments, count = carried
+            before, moments, count, _ = carried
             state, moments, _ = self._sweep(before, moments, share, jax.random.fold_in(key, count), warm=False)
             return state, moments, count + 1, jnp.any(state != before)
 
@@ -116,7 +116,7 @@ class Sampler(eqx.Module):
             return carried[-1] & (carried[2] < ROUND)
 
         first = state, self._moments(state), jnp.asarray(0), jnp.asarray(True)
-        state, *_ = jax.lax.while_loop(changing, lambda carried: sweep(carried[:3]), first)
+        state, *_ = jax.lax.while_loop(changing, sweep, first)
         return state, self._moments(state).mean
 
     def _moments(self, state: Int[Array, " n"]) -> "Moments":

@@ -126,7 +126,7 @@ def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
     closed, *_ = light
     begun = closed.stages[0].fitted
     folded = dataclasses.replace(begun, cost=np.nan)
-    there = iter([(begun, []), (folded, [])])
+    there = iter([begun, folded])
     monkeypatch.setattr(fitting, "_reckoned", lambda *_: next(there))
     monkeypatch.setattr(fitting, "_better", lambda *_: (begun.point, begun.cost - 1))
     assert fit(closed.problem, begun.named, begun.point, {1}) is begun

@@ -90,11 +90,12 @@ def close_the_loop(
         before = foretell(problem, stages[0].fitted, spare)
         reported = before, foretell(problem, stages[-1].fitted, spare) if accepted else before
     last = stages[-1]
-    missed = ([Foretold.together(last.folds)] if last.folds else []) + ([] if reported is None else [reported[1]])
+    folds = [Foretold.together(last.folds)] if last.folds else []
+    missed = folds + ([] if reported is None else [reported[1]])
     left_over = last.left.gain > REMAINDER or any(one.excess > EXCESS for one in missed)
     verdict, final = _verdict(accepted, rivals, left_over), last.fitted
-    if verdict in LEFT_OVER and last.folds:
-        doubt = max(Foretold.together(last.folds).excess, 1.0)
+    if verdict in LEFT_OVER and folds:
+        doubt = max(folds[0].excess, 1.0)
         say(f"what frames say counts {doubt:.1f} times less, as each of the parts is missed by that without it")
         final = doubted(problem, final, doubt)
     return Closed(

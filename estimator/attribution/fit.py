@@ -52,12 +52,26 @@ class Fitted:
     glances: dict[int, Glance]
     weights: dict[int, Metric]
     """By frame."""
-    site_precision: Float[np.ndarray, " n"]
-    """How sure the belief is of each s besides what frames say."""
-    probability: Float[np.ndarray, " n"]
-    """P(attached) of each. Of attachments that are likeliest together none need be likely by itself."""
+    stated: Stated
+    """What is believed of the attachments, whatever the free parameters are."""
     cost: float
     """Twice the negative logarithm of likelihood and prior under its own weights [nat]."""
+
+    @property
+    def belief(self) -> AttachmentBelief:
+        """Of the attachments."""
+        assert isinstance(self.stated.belief, AttachmentBelief)
+        return self.stated.belief
+
+    @property
+    def site_precision(self) -> Float[np.ndarray, " n"]:
+        """How sure the belief is of each s besides what frames say."""
+        return np.asarray(self.belief.site_precision)
+
+    @property
+    def probability(self) -> Float[np.ndarray, " n"]:
+        """P(attached) of each. Of attachments that are likeliest together none need be likely by itself."""
+        return np.asarray(self.stated.probability)
 
     @property
     def attached(self) -> Bool[np.ndarray, " n"]:
@@ -88,13 +102,13 @@ def fit(
     say: Callable[[str], None] = lambda _: None,
 ) -> Fitted:
     """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some parts."""
-    now, steps = _reckoned(problem, named, point, problem.frames(parts))
+    now = _reckoned(problem, named, point, problem.frames(parts))
     for count in range(passes):
-        if (better := _better(problem, now, steps)) is None:
+        if (better := _better(problem, now, _steps(problem, now))) is None:
             break
         trial, cost = better
         say(f"pass {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
-        there, steps = _reckoned(problem, named, trial, problem.frames(parts))
+        there = _reckoned(problem, named, trial, problem.frames(parts))
         if not np.isfinite(there.cost):
             break
         now = there
@@ -109,8 +123,8 @@ def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
     """
     left = [k for k in fitted.glances if problem.history.frames[k].part != part]
     glances, weights = {k: fitted.glances[k] for k in left}, {k: fitted.weights[k] for k in left}
-    now, steps = _found(problem, fitted.named, fitted.point, glances, weights)
-    better = _better(problem, now, steps[:2], least=0.0)
+    now = _found(problem, fitted.named, fitted.point, glances, weights)
+    better = _better(problem, now, _steps(problem, now, together=False), least=0.0)
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
 
@@ -119,8 +133,8 @@ def doubted(problem: Problem, fitted: Fitted, excess: float) -> Fitted:
 
     All that its frames say counts by as much less: quasi-likelihood [Wedderburn 1974, doi:10.1093/biomet/61.3.439].
     """
-    _, stated = _steps(problem, fitted.square / excess, fitted.point, fitted.free, problem.sd(fitted.named))
-    return replace(fitted, probability=np.asarray(stated.probability))
+    sd = problem.sd(fitted.named)
+    return replace(fitted, stated=_stated(problem, fitted.square / excess, fitted.point, fitted.free, sd))
 
 
 def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
@@ -133,8 +147,8 @@ def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, 
     return (plain_there - better.cost) / 2, (plain.cost - better_there) / 2
 
 
-def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> tuple[Fitted, list[Step]]:
-    """A point with what is known there, and the steps that may be taken from it."""
+def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> Fitted:
+    """A point with what is known there."""
     along = directions(problem, problem.free(named))
     weights = weighed(problem, point, frames)
     return _found(problem, named, point, linearised(problem, point, weights, along), weights)
@@ -142,23 +156,19 @@ def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[in
 
 def _found(
     problem: Problem, named: np.ndarray, point: Point, glances: dict[int, Glance], weights: dict[int, Metric]
-) -> tuple[Fitted, list[Step]]:
+) -> Fitted:
     free, sd = problem.free(named), problem.sd(named)
     square = reduced(problem, glances, len(free))
-    steps, stated = _steps(problem, square, point, free, sd)
-    assert isinstance(stated.belief, AttachmentBelief)
-    found = Fitted(
+    return Fitted(
         point=point,
         named=named,
         free=free,
         square=square,
         glances=glances,
         weights=weights,
-        site_precision=np.asarray(stated.belief.site_precision),
-        probability=np.asarray(stated.probability),
+        stated=_stated(problem, square, point, free, sd),
         cost=_cost(problem, weights, point, named),
     )
-    return found, steps
 
 
 def _better(problem: Problem, now: Fitted, steps: list[Step], *, least: float = GAIN) -> tuple[Point, float] | None:
@@ -197,31 +207,41 @@ def _promised(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: 
     return less + _prior(point.theta, point.s, free, sd) - _prior(theta, s, free, sd)
 
 
-def _steps(
-    problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray
-) -> tuple[list[Step], Stated]:
+def _steps(problem: Problem, now: Fitted, *, together: bool = True) -> list[Step]:
     """To the s that samples find attached one by one, at the s at hand, and to those likeliest together.
 
-    Each with the parameters that fit it best; and what the belief states. Where any of many may carry a load, none of
-    them is likelier attached than not, and yet one must be.
+    Each with the parameters that fit it best. Where any of many may carry a load, none of them is likelier attached
+    than not, and yet one must be.
     """
-    n, d = len(point.s), len(free)
-    A = square[n : n + d, n : n + d] + np.diag(sd**-2)
-    C, gs = square[:n, n : n + d], square[:n, -1]
-    gt = square[n : n + d, -1] + point.theta[free] / sd**2
-    L = square[:n, :n] - C @ np.linalg.solve(A, C.T)
-    shift = L @ point.s - gs + C @ np.linalg.solve(A, gt)
-    stated = reconsidered(problem.prior.add(jnp.asarray(L), jnp.asarray(shift)))
-    s = np.asarray(problem.prior.bounded(jnp.where(stated.probability > 0.5, stated.b, 0.0)))
-    assert isinstance(stated.belief, AttachmentBelief)
-    together = np.asarray(likeliest(stated.belief))
+    point, free, sd = now.point, now.free, problem.sd(now.named)
+    A, C, gt = _of_parameters(now.square, point, free, sd)
 
     def step(to: Float[np.ndarray, " n"]) -> Step:
         theta = np.zeros(len(point.theta))
         theta[free] = np.clip(-np.linalg.solve(A, gt + C.T @ (to - point.s)), -FAR * sd, FAR * sd)
         return theta, to - point.s
 
-    return [step(s), step(point.s), step(together)], stated
+    found = np.asarray(problem.prior.bounded(jnp.where(now.stated.probability > 0.5, now.stated.b, 0.0)))
+    steps = [step(found), step(point.s)]
+    return [*steps, step(np.asarray(likeliest(now.belief)))] if together else steps
+
+
+def _stated(problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> Stated:
+    """What is believed of the attachments there, the parameters marginalised."""
+    n = len(point.s)
+    A, C, gt = _of_parameters(square, point, free, sd)
+    L = square[:n, :n] - C @ np.linalg.solve(A, C.T)
+    shift = L @ point.s - square[:n, -1] + C @ np.linalg.solve(A, gt)
+    return reconsidered(problem.prior.add(jnp.asarray(L), jnp.asarray(shift)))
+
+
+def _of_parameters(
+    square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray
+) -> tuple[Float[np.ndarray, "d d"], Float[np.ndarray, "n d"], Float[np.ndarray, " d"]]:
+    """Of normal equations and prior: the free parameters' own, those with s, and the gradient."""
+    n, d = len(point.s), len(free)
+    own = square[n : n + d, n : n + d] + np.diag(sd**-2)
+    return own, square[:n, n : n + d], square[n : n + d, -1] + point.theta[free] / sd**2
 
 
 def _cost(problem: Problem, weights: dict[int, Metric], point: Point, named: np.ndarray) -> float:
