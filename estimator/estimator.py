@@ -59,7 +59,7 @@ class Estimator:
         Args:
             declaration: what the user says of the tissue.
             camera: needed for observations with images.
-            config: settings; the defaults are those that the README's figures were made with.
+            config: settings; the defaults are those that the figures of docs/RESULTS.md were made with.
             mask: which pixels are tissue; by colour if None.
             disparity: dense stereo; semi-global matching if None.
         """

@@ -34,7 +34,7 @@ MAIN = tuple(
     for sensing in ("stereo", "particles")
     for scene in ("arc", "line", "u_shape", "line_dot", "arc_line", "arc_soft", "arc_stiff", "arc_weld", "free")
 )
-"""The README's table."""
+"""The table of docs/RESULTS.md."""
 FIGURES = (
     ("attached", ("detection", "n_attached"), 1.0, 0),
     ("reported", ("detection", "n_detected"), 1.0, 0),

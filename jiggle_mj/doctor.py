@@ -194,7 +194,7 @@ def _cores() -> Check:
         name="cores",
         ok=ok,
         detail=str(found),
-        remedy="" if ok else "Everything works, slower than the README's figures.",
+        remedy="" if ok else "Everything works, slower than the figures of docs/RESULTS.md.",
     )
 
 

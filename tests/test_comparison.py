@@ -64,6 +64,9 @@ def test_the_likeliest_of_those_that_foretell_as_well_is_the_best():
         ("friction", 290.0, 0.6, True),  # foretells worse
         ("stretch", 100.0, 0.8, False),  # often confused: less is enough
         ("stretch", 100.0, 0.9, True),
+        ("friction", 310.0, 0.8, False),  # explains more where it foretells worse
+        ("heterogeneity", 290.0, 0.5, True),  # has more parameters and explains less
+        ("heterogeneity", 298.0, 0.5, False),
     ],
 )
 def test_what_cannot_be_told_from_the_best(name, gain, error, told):
@@ -77,7 +80,10 @@ def test_what_cannot_be_told_from_the_best(name, gain, error, told):
         (trial("gravity", 300.0, 0.5, 0.5, 0.5, 0.5), None),
         (trial("gravity", 300.0, 0.5, 0.5, 1.01, 1.01), None),  # half of them is enough
         (trial("gravity", 300.0, 0.5, 1.01, 1.01, 1.01), "better in 1 of 4"),
-        (trial("gravity", 300.0, 0.98, 0.98, 0.98, 0.98), "0.98 mm with it and 1.00 mm without, better in 4 of 4"),
+        (trial("gravity", 35.0, 0.98, 0.98, 0.98, 0.98), "0.98 mm with it and 1.00 mm without, better in 4 of 4"),
+        (trial("gravity", 45.0, 0.98, 0.98, 0.98, 0.98, left=15.0), None),  # certain, and leaves little
+        (trial("gravity", 45.0, 0.98, 0.98, 0.98, 0.98, left=25.0), "0.98 mm with it and 1.00 mm without"),
+        (trial("gravity", 45.0, 1.01, 1.01, 0.99, 0.99), "1.00 mm with it and 1.00 mm without, better in 2 of 4"),
         (trial("gravity", 15.0, 0.9, 0.9, 0.9, 0.9), "larger errors without a cause explain"),
         (trial("gravity", 15.0, 0.7, 0.7, 0.7, 0.7), None),  # foretelling decides
         (trial("gravity", 300.0, 0.5, 0.5, 0.5, 0.5, theta=4.0), "beyond 3.5 prior standard deviations"),

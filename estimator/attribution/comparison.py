@@ -12,6 +12,9 @@ EXPLAINED = 0.85
 BETTER, DECISIVE = 0.97, 0.8
 """Shares of the error over all parts left out that an effect must bring it to, unless it accounts for all that was left
 over, and from which on it need not beat larger errors without a cause."""
+CERTAIN, LITTLE = 40.0, 20.0
+"""Log Bayes factor from which, and what it leaves to larger errors up to which, an effect need not foretell better, but
+no worse: what is felt in one grasp alone cannot be foretold by others [nat]."""
 
 
 def best(passed: list[Trial]) -> Trial:
@@ -32,15 +35,17 @@ def behind(one: Trial, best: Trial) -> str:
 def not_told_from(one: Trial, best: Trial) -> bool:
     """Whether an effect explains as much as the best, and foretells what was left out about as well.
 
-    For two that are often confused with each other it takes less.
+    For two that are often confused with each other it takes less, and where one explains more and the other foretells
+    better. It takes more where it has more parameters and yet explains less: whatever else is wrong favours these.
     """
     likelier = best.log_bayes_factor - one.log_bayes_factor
     if not best.folds:
         return likelier < LEAD
-    if one.effect.name in best.effect.confounded_with and best.effect.name in one.effect.confounded_with:
+    confused = one.effect.name in best.effect.confounded_with and best.effect.name in one.effect.confounded_with
+    if confused or likelier < 0:
         return one.missed * CONFUSED <= best.missed
-    as_likely = likelier < max(LEAD, (1 - EXPLAINED) * best.log_bayes_factor)
-    return as_likely and one.missed * AS_GOOD <= best.missed
+    lead = LEAD if len(one.at) > len(best.at) else max(LEAD, (1 - EXPLAINED) * best.log_bayes_factor)
+    return likelier < lead and one.missed * AS_GOOD <= best.missed
 
 
 def against(best: Trial, stage: Stage) -> str | None:
@@ -52,7 +57,8 @@ def against(best: Trial, stage: Stage) -> str | None:
     if after > DECISIVE * before and best.log_bayes_factor + best.left.gain < stage.left.gain + ENTER:
         return "larger errors without a cause explain the frames as well"
     better = sum(b.rms < a.rms for a, b in zip(stage.folds, best.folds, strict=True))
-    enough = 1.0 if best.left.gain < REMAINDER < stage.left.gain else BETTER
+    certain = best.log_bayes_factor > CERTAIN and best.left.gain < LITTLE
+    enough = 1.0 if certain or best.left.gain < REMAINDER < stage.left.gain else BETTER
     if stage.folds and (after > enough * before or 2 * better < len(stage.folds)):
         return (
             f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "

@@ -73,8 +73,7 @@ def _bending(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> Sh
 
 
 def _heterogeneity(model: SheetModel, theta: Float[Array, " modes"], moment: Moment) -> SheetModel:
-    modes = cosines(_places(model, moment), MODES)[:, 1:]
-    return _stiffer(model, jnp.exp(modes @ theta)[:, None, None])
+    return _stiffer(model, jnp.exp(cosines(_places(model, moment), MODES) @ theta)[:, None, None])
 
 
 def _inclusion(model: SheetModel, theta: Float[Array, " spots"], moment: Moment) -> SheetModel:
@@ -135,8 +134,8 @@ def _places(model: SheetModel, moment: Moment) -> Float[Array, "f 2"]:
 
 def _falling() -> tuple[float, ...]:
     """Smooth fields are likelier: half a factor of e in the lowest modes, less with the square of the wave number."""
-    wave = np.add.outer(np.arange(MODES) ** 2, np.arange(MODES) ** 2).ravel()[1:]
-    return tuple(float(one) for one in 0.6 / wave)
+    wave = np.add.outer(np.arange(MODES) ** 2, np.arange(MODES) ** 2).ravel()
+    return tuple(float(one) for one in 0.6 / np.maximum(wave, 1))
 
 
 MECHANICAL = (
@@ -183,7 +182,7 @@ MECHANICAL = (
     Effect(
         name="heterogeneity",
         acts=_heterogeneity,
-        units=("log factor",) * (MODES**2 - 1),
+        units=("log factor",) * MODES**2,
         prior_sd=_falling(),
         source="Young's modulus of skin differs between places by factors of 2 to 5",
         confounded_with=("inclusion", "anisotropy", "attachments"),
@@ -201,9 +200,9 @@ MECHANICAL = (
         name="anisotropy",
         acts=_anisotropy,
         units=("k",),
-        prior_sd=(1.0,),
+        prior_sd=(1.5,),
         sites=ANGLES,
-        source="skin along and across Langer's lines",
+        source="skin of a chicken's leg has 1.7 to 7.9 MPa, by direction and sample",
         confounded_with=("heterogeneity", "pre_strain", "poisson"),
     ),
     Effect(
