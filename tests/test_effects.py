@@ -201,3 +201,19 @@ def test_a_users_effect_is_checked(changed, says):
     }
     with pytest.raises(ValueError, match=says):
         Effect(**{**given, **changed})
+
+
+def test_what_slides_is_seen_where_a_bent_sheet_is_and_stops_at_its_edge(plain, moment):
+    with jax.enable_x64(True):
+        rest, membrane = sheet().rest, plain.term(TriangleMembrane)
+        bent = np.column_stack([rest[:, 0], rest[:, 1], 3 * rest[:, 0] ** 2 - 2 * rest[:, 0] * rest[:, 1]])
+        slope = np.zeros((len(rest), 3, 2))
+        slope[:, 0, 0] = slope[:, 1, 1] = 1.0
+        slope[:, 2] = np.column_stack([6 * rest[:, 0] - 2 * rest[:, 1], -2 * rest[:, 0]])
+        by = np.array([0.0071, -0.0043])
+        view = EFFECTS["point_slip"].acts(plain, jnp.asarray(by / float(moment.time)), moment).view
+        assert np.allclose(np.mean(np.asarray(tangents(membrane, jnp.asarray(rest))), axis=0), np.eye(3)[:, :2])
+        slid = np.clip(rest[:, :2] + by, rest[:, :2].min(axis=0), rest[:, :2].max(axis=0))
+        seen = np.asarray(view(jnp.asarray(bent), tangents=jnp.asarray(slope)))
+        np.testing.assert_allclose(seen[:, :2], slid, atol=1e-12)
+        np.testing.assert_allclose(seen[:, 2], 3 * slid[:, 0] ** 2 - 2 * slid[:, 0] * slid[:, 1], atol=1e-12)

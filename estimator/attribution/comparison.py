@@ -5,6 +5,8 @@ from jiggle_mj.estimator.attribution.trials import ABSURD, ENTER, REMAINDER, Sta
 
 LEAD = 3.0
 """By how much an effect must lead the next to be named alone, whatever the shares [nat]."""
+FORETELLING = 0.25
+"""Power of the error by which the nats that an effect explains are divided when the best is looked for."""
 AS_GOOD, CONFUSED = 0.9, 0.6
 """Shares of its error from which an effect counts as no worse than the best, and one that is often confused with it."""
 EXPLAINED = 0.85
@@ -12,22 +14,21 @@ EXPLAINED = 0.85
 BETTER, DECISIVE = 0.97, 0.8
 """Shares of the error over all parts left out that an effect must bring it to, unless it accounts for all that was left
 over, and from which on it need not beat larger errors without a cause."""
-CERTAIN, LITTLE = 40.0, 20.0
+CERTAIN, LITTLE = 30.0, 20.0
 """Log Bayes factor from which, and what it leaves to larger errors up to which, an effect need not foretell better, but
 no worse: what is felt in one grasp alone cannot be foretold by others [nat]."""
 
 
 def best(passed: list[Trial]) -> Trial:
-    """The likeliest of those that foretell about as well as the one that does it best."""
+    """The one that explains most, but for how badly it foretells."""
     if not passed[0].folds:
         return max(passed, key=lambda one: one.log_bayes_factor)
-    least = min(one.missed for one in passed)
-    return max((one for one in passed if one.missed * AS_GOOD <= least), key=lambda one: one.log_bayes_factor)
+    return max(passed, key=lambda one: one.log_bayes_factor / one.missed**FORETELLING)
 
 
 def behind(one: Trial, best: Trial) -> str:
     """Why an effect is neither added nor named beside the best."""
-    if best.folds and best.missed < one.missed * AS_GOOD:
+    if one.log_bayes_factor > best.log_bayes_factor:
         return f"{best.effect.name} foretells better, to {1e3 * best.missed:.2f} mm against {1e3 * one.missed:.2f}"
     return f"{best.effect.name} is likelier by {best.log_bayes_factor - one.log_bayes_factor:.0f} nat"
 

@@ -67,7 +67,8 @@ def closed_on(sheet: Sheet, theta: Float[Array, " p"], frame: ClosedFrame, momen
     then = (moment.time - moment.closed, jnp.zeros_like(moment.closed))
     model = sheet.model(theta, eqx.tree_at(lambda m: (m.time, m.closed), moment, then), frame.way)
     along = tangents(model.term(TriangleMembrane), moment.rest)
-    return 2 * frame.turned - model.view(frame.turned, tangents=along)
+    slid = model.view.followed(moment.rest, along) - moment.rest
+    return 2 * frame.turned - model.view.moved(frame.turned + slid)
 
 
 def beyond_tool(

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.bending import IsometricBending
 from jiggle_mj.estimator.effects.effect import Effect
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, tangents
+from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, across, extent
 from jiggle_mj.estimator.effects.terms import Film, Load
 from jiggle_mj.estimator.environment import Bed, Weight
 from jiggle_mj.estimator.membrane import TriangleMembrane, plane_stress
@@ -23,10 +23,8 @@ ANGLES = 12
 
 def flat(membrane: TriangleMembrane, rest: Float[Array, "n 3"], x: Float[Array, "m 3"]) -> Float[Array, "m 2"]:
     """Places in the sheet along its two material axes, from 0 to 1 over its extent."""
-    axes = jnp.mean(tangents(membrane, rest), axis=0)
-    across = rest @ axes
-    low, high = jnp.min(across, axis=0), jnp.max(across, axis=0)
-    return (x @ axes - low[None]) / (high - low)[None]
+    low, high = extent(across(membrane, rest, rest))
+    return (across(membrane, rest, x) - low) / (high - low)
 
 
 def spots(place: Float[Array, "m 2"]) -> Float[Array, "m spots"]:

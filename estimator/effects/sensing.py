@@ -4,7 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.effects.effect import Effect
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel
+from jiggle_mj.estimator.effects.followed import Followed
+from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, across, extent
+from jiggle_mj.estimator.membrane import TriangleMembrane
 
 SMALL_ANGLE = 1e-3
 """[rad]."""
@@ -53,8 +55,11 @@ def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], moment: Moment) -
 
 
 def _point_slip(model: SheetModel, theta: Float[Array, " 2"], moment: Moment) -> SheetModel:
-    """What is followed slides over the sheet, more and more."""
-    return eqx.tree_at(lambda one: one.view.slip, model, model.view.slip + moment.time * theta)
+    """What is followed slides over the sheet, more and more, at most to its edge."""
+    membrane = model.term(TriangleMembrane)
+    place = across(membrane, moment.rest, moment.rest)
+    to = jnp.clip(place + moment.time * theta[None], *extent(place))
+    return eqx.tree_at(lambda one: one.view.followed, model, Followed.at(membrane, place, to))
 
 
 def _at_another_time(model: SheetModel, moment: Moment, later: Float[Array, ""]) -> SheetModel:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.block_tridiagonal import Layout
+from jiggle_mj.estimator.effects.followed import Followed
 from jiggle_mj.estimator.effects.terms import Film, Load, Rub
 from jiggle_mj.estimator.energy import SheetEnergy, Term
 from jiggle_mj.estimator.environment import Tether, Weight
@@ -29,20 +30,22 @@ STOOD = 1e-4
 
 
 class View(eqx.Module):
-    """How positions are seen: `shift` + `centre` + `turn` (x - `centre`), after what slips."""
+    """How positions are seen: `shift` + `centre` + `turn` (x - `centre`), of what is followed."""
 
     centre: Float[Array, " 3"]
     """The middle of the sheet at rest [m]."""
     turn: Float[Array, "3 3"]
     shift: Float[Array, " 3"]
     """[m]."""
-    slip: Float[Array, " 2"]
-    """How far what is followed has slid over the sheet, along its two material axes [m]."""
+    followed: Followed
 
     def __call__(self, x: Float[Array, "n 3"], *, tangents: Float[Array, "n 3 2"]) -> Float[Array, "n 3"]:
-        """Where particles at x are seen that slide along `tangents`."""
-        there = x + tangents @ self.slip
-        return self.centre[None] + self.shift[None] + (there - self.centre[None]) @ self.turn.T
+        """Where what is followed is seen, for particles at x and the sheet's derivatives there."""
+        return self.moved(self.followed(x, tangents))
+
+    def moved(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """Where points at x are seen."""
+        return self.centre[None] + self.shift[None] + (x - self.centre[None]) @ self.turn.T
 
 
 class SheetModel(eqx.Module):
@@ -144,7 +147,21 @@ def tangents(membrane: TriangleMembrane, x: Float[Array, "n 3"]) -> Float[Array,
     return total / around[:, None, None]
 
 
+def across(membrane: TriangleMembrane, rest: Float[Array, "n 3"], x: Float[Array, "m 3"]) -> Float[Array, "m 2"]:
+    """Places in the sheet along its two material axes [m]."""
+    return x @ jnp.mean(tangents(membrane, rest), axis=0)
+
+
+def extent(place: Float[Array, "n 2"]) -> tuple[Float[Array, "1 2"], Float[Array, "1 2"]]:
+    """The least and the largest of the sheet's places."""
+    return jnp.min(place, axis=0, keepdims=True), jnp.max(place, axis=0, keepdims=True)
+
+
 def centred(rest: Float[np.ndarray, "n 3"]) -> View:
     """As it is."""
-    nothing = jnp.zeros(3)
-    return View(centre=jnp.asarray(rest.mean(axis=0)), turn=jnp.eye(3), shift=nothing, slip=jnp.zeros(2))
+    return View(
+        centre=jnp.asarray(rest.mean(axis=0)),
+        turn=jnp.eye(3),
+        shift=jnp.zeros(3),
+        followed=Followed.themselves(len(rest)),
+    )

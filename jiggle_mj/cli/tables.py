@@ -23,9 +23,9 @@ def table(
 
     Args:
         name: main is that of docs/RESULTS.md; active is the paper's comparison of policies, with ours; acts is whether
-            failed cuts and sutures are noticed; undeclared is whether close-loop names what nobody declares; scalability
-            times plans at three sizes, on this machine; simulation and one-lift are the paper's, with its printed
-            figures and all baselines.
+            failed cuts and sutures are noticed; undeclared is whether close-loop names what nobody declares;
+            scalability times plans at three sizes, on this machine; simulation and one-lift are the paper's, with its
+            printed figures and all baselines.
         out: holds a folder for each run, and of active the curves, active.html.
         seeds: of each row; 0 to 2 for main, 0 to 5 for acts, 0 to 4 for undeclared and 0 to 9 for the paper's if left
             out.
