@@ -29,7 +29,7 @@ from jiggle_mj.eval.discrepancy_page import story, write_page
 from small_sheet import DECLARATION, GRIP_RADIUS, STIFFNESS, attached, lifts, sheet, sheet_balance, sheet_energy
 
 from jiggle_mj.estimate import Sheet
-from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
+from jiggle_mj.observation import DeclaredMesh, MeasuredPoints, Observation, ToolState
 
 NOISE = 1e-4
 STILL = 10
@@ -321,6 +321,20 @@ def test_without_still_frames_the_noise_is_assumed_and_said_to_be():
     rest = dataclasses.replace(rest, points=seen(1.0)[0].points)
     gathered = gather(DECLARATION, None, [rest, *observations])
     assert gathered.noise == assumed(NOISE)
+
+
+def test_time_runs_from_when_the_sheet_lay_as_its_rest_shape_has_it():
+    """The mean of the frames before the first grasp, or the first where the mesh is declared."""
+    observations = seen(1.0)
+    lying = [one for one in observations if not one.tool.closed]
+    some = [*lying, *(one for one in observations if one.tool.closed)][: len(lying) + 2]
+    ids = lying[0].points.track_id
+    declared = dataclasses.replace(
+        DECLARATION, mesh=DeclaredMesh(vertices=sheet().rest, faces=sheet().faces, track_id=ids)
+    )
+    for declaration, since in ((DECLARATION, np.mean([one.time for one in lying])), (declared, lying[0].time)):
+        times = [one.time for one in gather(declaration, None, some).frames]
+        np.testing.assert_allclose(times, [(one.time - since) / 1e9 for one in some[len(lying) :]], atol=1e-6)
 
 
 def _sheet(closed):

@@ -59,7 +59,7 @@ def gather(
     estimator, frames, stated = Estimator(declaration, camera, config=config), [], ASSUMED_SD
     still: list[MeasuredPoints] = []
     standing: dict[int, list[MeasuredPoints]] = {}
-    began: int | None = None
+    lying: list[int] = []
     grasp, closed = -1, 0
     for observation in observations:
         found = estimator.update(observation)
@@ -67,14 +67,15 @@ def gather(
         if observation.points is not None:
             stated = observation.points.sd
         if found is None:
+            if not frames:
+                lying.append(observation.time)
             if not frames and observation.points is not None:
                 still.append(observation.points)
-            began = observation.time if not frames else began
             continue
         if observation.tool.grasp != grasp:
             grasp, closed = observation.tool.grasp, observation.time
-        began = observation.time if began is None else began
-        frames.append(_timed(estimator, observation, found, since=began, closed=closed))
+        since = _at_rest(lying or [observation.time], averaged=bool(still) and declaration.mesh is None)
+        frames.append(_timed(estimator, observation, found, since=since, closed=closed))
         if observation.points is not None and np.linalg.norm(frames[-1].frame.way) < STANDING:
             standing.setdefault(grasp, []).append(observation.points)
     if not frames:
@@ -91,6 +92,14 @@ def gather(
         detection=estimator.detection,
         left_out=tuple(frames[k].index for k in mistaken),
     )
+
+
+def _at_rest(lying: list[int], *, averaged: bool) -> int:
+    """When the sheet lay as its rest shape has it, of the times of frames before the first grasp [ns].
+
+    In the mean of these, where it is their mean; else in the first, which images begin with, and a declared mesh.
+    """
+    return sum(lying) // len(lying) if averaged else lying[0]
 
 
 def assumed(sd: float) -> StillNoise:

@@ -10,8 +10,8 @@ from jiggle_mj.estimator.membrane import TriangleMembrane
 class Followed(eqx.Module):
     """A point of the sheet for each particle, in one of its triangles.
 
-    Between the corners of a triangle the sheet is a cubic Bezier patch with its derivatives at the corners [PN
-    triangles: Vlachos et al. 2001, doi:10.1145/364338.364387]: exact where it is quadratic, and smooth at the particles.
+    Between the corners of a triangle the sheet is a cubic Bezier patch with its derivatives there [PN triangles:
+    Vlachos et al. 2001, doi:10.1145/364338.364387]: exact where it is quadratic, and smooth at the particles.
     """
 
     corners: Int[Array, "n 3"]
