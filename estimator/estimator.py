@@ -115,6 +115,11 @@ class Estimator:
         return self._lying
 
     @property
+    def rest_time(self) -> int:
+        """When the sheet lay as its rest shape has it [ns], once a frame has shown it."""
+        return self._sight.rest_time
+
+    @property
     def hold(self) -> GripHold | None:
         """What the jaws hold; None while they are open."""
         return self._hold

@@ -324,17 +324,17 @@ def test_without_still_frames_the_noise_is_assumed_and_said_to_be():
 
 
 def test_time_runs_from_when_the_sheet_lay_as_its_rest_shape_has_it():
-    """The mean of the frames before the first grasp, or the first where the mesh is declared."""
+    """The mean of the frames before the first grasp; the first where the mesh is declared, or the jaws never open."""
     observations = seen(1.0)
-    lying = [one for one in observations if not one.tool.closed]
-    some = [*lying, *(one for one in observations if one.tool.closed)][: len(lying) + 2]
-    ids = lying[0].points.track_id
-    declared = dataclasses.replace(
-        DECLARATION, mesh=DeclaredMesh(vertices=sheet().rest, faces=sheet().faces, track_id=ids)
-    )
-    for declaration, since in ((DECLARATION, np.mean([one.time for one in lying])), (declared, lying[0].time)):
-        times = [one.time for one in gather(declaration, None, some).frames]
-        np.testing.assert_allclose(times, [(one.time - since) / 1e9 for one in some[len(lying) :]], atol=1e-6)
+    lying, (first, second) = observations[:STILL], observations[STILL : STILL + 2]
+    began = dataclasses.replace(first, index=STILL - 1, time=first.time - 10**9, points=lying[0].points)
+    mesh = DeclaredMesh(vertices=sheet().rest, faces=sheet().faces, track_id=lying[0].points.track_id)
+    for declaration, before, since in (
+        (DECLARATION, lying, float(np.mean([one.time for one in lying]))),
+        (dataclasses.replace(DECLARATION, mesh=mesh), [began], began.time),
+    ):
+        times = [one.time for one in gather(declaration, None, [*before, first, second]).frames][-2:]
+        np.testing.assert_allclose(times, [(first.time - since) / 1e9, (second.time - since) / 1e9])
 
 
 def _sheet(closed):

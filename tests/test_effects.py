@@ -11,6 +11,8 @@ from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.estimator.effects.sheet_model import STOOD, Moment, SheetModel, centred, tangents, undisturbed
 from jiggle_mj.estimator.environment import Weight
 from jiggle_mj.estimator.membrane import TriangleMembrane
+from jiggle_mj.estimator.mesh import SheetMesh
+from scipy.spatial.transform import Rotation
 from small_sheet import DECLARATION, lifts, sheet, sheet_energy
 
 STEP = 1e-4
@@ -204,6 +206,7 @@ def test_a_users_effect_is_checked(changed, says):
 
 
 def test_what_slides_is_seen_where_a_bent_sheet_is_and_stops_at_its_edge(plain, moment):
+    """z = 3 x^2 - 2 x y, which a patch repeats."""
     with jax.enable_x64(True):
         rest, membrane = sheet().rest, plain.term(TriangleMembrane)
         bent = np.column_stack([rest[:, 0], rest[:, 1], 3 * rest[:, 0] ** 2 - 2 * rest[:, 0] * rest[:, 1]])
@@ -213,7 +216,26 @@ def test_what_slides_is_seen_where_a_bent_sheet_is_and_stops_at_its_edge(plain, 
         by = np.array([0.0071, -0.0043])
         view = EFFECTS["point_slip"].acts(plain, jnp.asarray(by / float(moment.time)), moment).view
         assert np.allclose(np.mean(np.asarray(tangents(membrane, jnp.asarray(rest))), axis=0), np.eye(3)[:, :2])
-        slid = np.clip(rest[:, :2] + by, rest[:, :2].min(axis=0), rest[:, :2].max(axis=0))
+        slid, (low, high) = rest[:, :2] + by, (rest[:, :2].min(axis=0), rest[:, :2].max(axis=0))
+        inside = np.all((slid > low + 3e-3) & (slid < high - 3e-3), axis=1)
         seen = np.asarray(view(jnp.asarray(bent), tangents=jnp.asarray(slope)))
-        np.testing.assert_allclose(seen[:, :2], slid, atol=1e-12)
-        np.testing.assert_allclose(seen[:, 2], 3 * slid[:, 0] ** 2 - 2 * slid[:, 0] * slid[:, 1], atol=1e-12)
+        np.testing.assert_allclose(seen[inside, :2], slid[inside], atol=1e-12)
+        curve = 3 * slid[:, 0] ** 2 - 2 * slid[:, 0] * slid[:, 1]
+        np.testing.assert_allclose(seen[inside, 2], curve[inside], atol=1e-12)
+        assert 10 < inside.sum() < len(inside)
+        assert np.all((seen[:, :2] > low - 1e-5) & (seen[:, :2] < high + 1e-5))
+
+
+def test_nothing_slides_at_zero_over_a_sheet_that_was_bent_and_turned_at_rest(plain, moment):
+    """Where places in the mean plane are closer together than in the triangles' own."""
+    with jax.enable_x64(True):
+        flat = sheet().rest
+        bent = np.column_stack([flat[:, 0], flat[:, 1], 4 * flat[:, 0] ** 2])
+        turned = bent @ Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix().T
+        mesh = SheetMesh(turned, sheet().faces)
+        model = SheetModel(energy=undisturbed(mesh, DECLARATION), tool=plain.tool, view=centred(turned))
+        there = dataclasses.replace(moment, rest=jnp.asarray(turned))
+        for theta in (0.0, 1e-12):
+            view = EFFECTS["point_slip"].acts(model, jnp.full(2, theta), there).view
+            seen = view(moment.now, tangents=tangents(model.term(TriangleMembrane), moment.now))
+            np.testing.assert_allclose(seen, moment.now, atol=1e-9)

@@ -44,7 +44,7 @@ class Timed:
     part: int
     """What is left out of fits together: the grasp, or a third of the only one."""
     time: float
-    """Since the sheet was seen at rest [s]."""
+    """Since the sheet lay as its rest shape has it [s]."""
     closed: float
     """Since the jaws closed [s]."""
     state: Float[np.ndarray, "n 3"]

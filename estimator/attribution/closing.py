@@ -2,7 +2,7 @@
 
 Fit with what is declared, score every effect at what is left, fit again with each of the likeliest; of those that beat
 larger errors without a cause, make sense by their size and foretell what is left out of the fit better, keep the one
-that explains most, but for how badly it foretells. Again for a second and a third.
+with most nats over the fourth root of the error to which it foretells them. Again for a second and a third.
 """
 
 from collections.abc import Callable

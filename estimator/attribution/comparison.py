@@ -13,14 +13,14 @@ EXPLAINED = 0.85
 """Share of the best log Bayes factor from which an effect counts as explaining as much."""
 BETTER, DECISIVE = 0.97, 0.8
 """Shares of the error over all parts left out that an effect must bring it to, unless it accounts for all that was left
-over, and from which on it need not beat larger errors without a cause."""
+over or is certain, and from which on it need not beat larger errors without a cause."""
 CERTAIN, LITTLE = 30.0, 20.0
 """Log Bayes factor from which, and what it leaves to larger errors up to which, an effect need not foretell better, but
 no worse: what is felt in one grasp alone cannot be foretold by others [nat]."""
 
 
 def best(passed: list[Trial]) -> Trial:
-    """The one that explains most, but for how badly it foretells."""
+    """The one with most nats over the fourth root of its error."""
     if not passed[0].folds:
         return max(passed, key=lambda one: one.log_bayes_factor)
     return max(passed, key=lambda one: one.log_bayes_factor / one.missed**FORETELLING)
@@ -28,7 +28,7 @@ def best(passed: list[Trial]) -> Trial:
 
 def behind(one: Trial, best: Trial) -> str:
     """Why an effect is neither added nor named beside the best."""
-    if one.log_bayes_factor > best.log_bayes_factor:
+    if one.log_bayes_factor > best.log_bayes_factor or best.missed < AS_GOOD * one.missed:
         return f"{best.effect.name} foretells better, to {1e3 * best.missed:.2f} mm against {1e3 * one.missed:.2f}"
     return f"{best.effect.name} is likelier by {best.log_bayes_factor - one.log_bayes_factor:.0f} nat"
 

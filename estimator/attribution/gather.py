@@ -59,7 +59,6 @@ def gather(
     estimator, frames, stated = Estimator(declaration, camera, config=config), [], ASSUMED_SD
     still: list[MeasuredPoints] = []
     standing: dict[int, list[MeasuredPoints]] = {}
-    lying: list[int] = []
     grasp, closed = -1, 0
     for observation in observations:
         found = estimator.update(observation)
@@ -67,15 +66,12 @@ def gather(
         if observation.points is not None:
             stated = observation.points.sd
         if found is None:
-            if not frames:
-                lying.append(observation.time)
             if not frames and observation.points is not None:
                 still.append(observation.points)
             continue
         if observation.tool.grasp != grasp:
             grasp, closed = observation.tool.grasp, observation.time
-        since = _at_rest(lying or [observation.time], averaged=bool(still) and declaration.mesh is None)
-        frames.append(_timed(estimator, observation, found, since=since, closed=closed))
+        frames.append(_timed(estimator, observation, found, closed=closed))
         if observation.points is not None and np.linalg.norm(frames[-1].frame.way) < STANDING:
             standing.setdefault(grasp, []).append(observation.points)
     if not frames:
@@ -94,20 +90,12 @@ def gather(
     )
 
 
-def _at_rest(lying: list[int], *, averaged: bool) -> int:
-    """When the sheet lay as its rest shape has it, of the times of frames before the first grasp [ns].
-
-    In the mean of these, where it is their mean; else in the first, which images begin with, and a declared mesh.
-    """
-    return sum(lying) // len(lying) if averaged else lying[0]
-
-
 def assumed(sd: float) -> StillNoise:
     """Where there are too few still frames: what is stated of each point, and as much that neighbours share."""
     return StillNoise(sd=sd, smooth_sd=sd, length=ASSUMED_LENGTH, frames=0)
 
 
-def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, since: int, closed: int) -> Timed:
+def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, closed: int) -> Timed:
     hold = estimator.hold
     assert hold is not None
     visible = np.all(np.isfinite(found.observed), axis=1)
@@ -128,11 +116,11 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, s
         index=found.index,
         grasp=observation.tool.grasp,
         part=observation.tool.grasp,
-        time=(found.time - since) / 1e9,
+        time=(found.time - estimator.rest_time) / 1e9,
         closed=(found.time - closed) / 1e9,
         state=found.positions,
         reports=tuple(
-            ((report.time - since) / 1e9, report.position - hold.tip)
+            ((report.time - estimator.rest_time) / 1e9, report.position - hold.tip)
             for report in (*observation.reports, ToolReport(time=observation.time, position=observation.tool.position))
             if report.time >= closed
         ),

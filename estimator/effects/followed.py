@@ -1,10 +1,16 @@
-"""Which material of the sheet is seen in each particle's place: its own, or what a tracker has slid to."""
+"""Which material of the sheet is seen in each particle's place: its own, or what a tracker has slid to.
+
+A place is a point of the plane that the sheet's two material axes span in the mean; a sheet that lies far from flat is
+not unrolled.
+"""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
-from jiggle_mj.estimator.membrane import TriangleMembrane
+
+BEYOND = 1e-3
+"""How far beyond a side a point may be, by the triangle's height: from the outline particles may go either way."""
 
 
 class Followed(eqx.Module):
@@ -30,9 +36,9 @@ class Followed(eqx.Module):
         )
 
     @classmethod
-    def at(cls, membrane: TriangleMembrane, place: Float[Array, "n 2"], to: Float[Array, "n 2"]) -> "Followed":
-        """Material at places [m], where particles are at `place`; beyond the outline the nearest triangle goes on."""
-        triangles, slope, first = jnp.asarray(membrane.vertices), membrane.shape_gradient, jnp.eye(3)[:1]
+    def at(cls, triangles: Int[Array, "f 3"], place: Float[Array, "n 2"], to: Float[Array, "n 2"]) -> "Followed":
+        """Material at places [m], where particles are at `place`; what is beyond the outline stops near it."""
+        slope, first = _slopes(place[triangles]), jnp.eye(3)[:1]
 
         def own(at: Float[Array, "n 2"]) -> Int[Array, " n"]:
             every = jnp.broadcast_to(jnp.arange(len(triangles))[:, None], triangles.shape)
@@ -45,10 +51,11 @@ class Followed(eqx.Module):
         still = jax.lax.stop_gradient(to)
         triangle = jax.lax.cond(jnp.all(still == place), own, around, still)
         corners = triangles[triangle]
-        along = to - place[corners[:, 0]]
+        weights = first + jnp.einsum("nka,na->nk", slope[triangle], to - place[corners[:, 0]])
+        weights = jnp.maximum(weights, -BEYOND)
         return cls(
             corners=corners,
-            weights=first + jnp.einsum("nka,na->nk", slope[triangle], along),
+            weights=weights / jnp.sum(weights, axis=1, keepdims=True),
             sides=place[corners][:, None] - place[corners][:, :, None],
         )
 
@@ -59,3 +66,11 @@ class Followed(eqx.Module):
         middle = jnp.sum(edges, axis=(1, 2)) / 4 - jnp.sum(at, axis=1) * 5 / 12
         share = w[:, :, None] ** 2 * w[:, None] * (3 - 2 * jnp.eye(3)[None])
         return jnp.einsum("nkj,nkji->ni", share, edges) + 6 * jnp.prod(w, axis=1)[:, None] * middle
+
+
+def _slopes(corners: Float[Array, "f 3 2"]) -> Float[Array, "f 3 2"]:
+    """Derivatives of barycentric coordinates [1/m]."""
+    opposite = jnp.roll(corners, -2, axis=1) - jnp.roll(corners, -1, axis=1)
+    across = jnp.stack([-opposite[..., 1], opposite[..., 0]], axis=-1)
+    height = jnp.sum(across * (corners - jnp.roll(corners, -1, axis=1)), axis=-1, keepdims=True)
+    return across / height

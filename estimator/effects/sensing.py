@@ -10,6 +10,8 @@ from jiggle_mj.estimator.membrane import TriangleMembrane
 
 SMALL_ANGLE = 1e-3
 """[rad]."""
+EDGE = 1e-6
+"""How far what slides may go beyond the edge, so that at rest it may go either way [m]."""
 
 
 def _tool_bias(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
@@ -55,11 +57,12 @@ def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], moment: Moment) -
 
 
 def _point_slip(model: SheetModel, theta: Float[Array, " 2"], moment: Moment) -> SheetModel:
-    """What is followed slides over the sheet, more and more, at most to its edge."""
+    """What is followed slides over the sheet, more and more, at most to the edge of the rectangle around it."""
     membrane = model.term(TriangleMembrane)
     place = across(membrane, moment.rest, moment.rest)
-    to = jnp.clip(place + moment.time * theta[None], *extent(place))
-    return eqx.tree_at(lambda one: one.view.followed, model, Followed.at(membrane, place, to))
+    low, high = extent(place)
+    to = jnp.clip(place + moment.time * theta[None], low - EDGE, high + EDGE)
+    return eqx.tree_at(lambda one: one.view.followed, model, Followed.at(jnp.asarray(membrane.vertices), place, to))
 
 
 def _at_another_time(model: SheetModel, moment: Moment, later: Float[Array, ""]) -> SheetModel:

@@ -77,7 +77,7 @@ class Moment(eqx.Module):
     rest: Float[Array, "n 3"]
     """[m]."""
     time: Float[Array, ""]
-    """Since the sheet was seen at rest [s]."""
+    """Since the sheet lay as its rest shape has it [s]."""
     gap: Float[Array, ""]
     """Since the frame before [s]."""
     earlier_gap: Float[Array, ""]
@@ -148,7 +148,7 @@ def tangents(membrane: TriangleMembrane, x: Float[Array, "n 3"]) -> Float[Array,
 
 
 def across(membrane: TriangleMembrane, rest: Float[Array, "n 3"], x: Float[Array, "m 3"]) -> Float[Array, "m 2"]:
-    """Places in the sheet along its two material axes [m]."""
+    """Places in the plane of the sheet's two mean material axes [m]."""
     return x @ jnp.mean(tangents(membrane, rest), axis=0)
 
 

@@ -44,6 +44,7 @@ class Sight:
         self._points = PointTracker(declaration.mesh)
         self._clouds: CloudTracker | None = None
         self._still: list[MeasuredPoints] = []
+        self._still_times: list[int] = []
         self._sheet: Sheet | None = None
 
     @property
@@ -68,14 +69,27 @@ class Sight:
             PerceptionError: it shows nothing, or shows no sheet and the jaws are closed.
         """
         if observation.images is not None and self._stereo is not None:
-            return None if self._sheet is not None else self._lay_over(observation.images, observation.tool)
+            if self._sheet is None and (passed_over := self._lay_over(observation.images, observation.tool)):
+                return passed_over
+            self._still_times = self._still_times or [observation.time]
+            return None
         if observation.points is None:
             raise PerceptionError(
                 f"observation {observation.index} has neither points nor images with a calibrated camera."
             )
         if not (observation.tool.closed and self._still):
             self._still.append(observation.points)
+            self._still_times.append(observation.time)
         return None
+
+    @property
+    def rest_time(self) -> int:
+        """When the sheet lay as `sheet` has it [ns]: in the mean of the frames that it is the mean of, or the first.
+
+        A declared mesh is taken to be that of the first frame.
+        """
+        times = self._still_times
+        return times[0] if self._declaration.mesh is not None else sum(times) // len(times)
 
     def sheet(self) -> Sheet:
         """The sheet at rest by the frames so far, fixed from then on.
