@@ -214,7 +214,7 @@ def test_what_slides_is_seen_where_a_bent_sheet_is_and_stops_at_its_edge(plain, 
         slope[:, 0, 0] = slope[:, 1, 1] = 1.0
         slope[:, 2] = np.column_stack([6 * rest[:, 0] - 2 * rest[:, 1], -2 * rest[:, 0]])
         by = np.array([0.0071, -0.0043])
-        view = EFFECTS["point_slip"].acts(plain, jnp.asarray(by / float(moment.time)), moment).view
+        view = EFFECTS["point_slip"].acts(plain, jnp.asarray([*(by / (float(moment.time) - 0.25)), 0.25]), moment).view
         assert np.allclose(np.mean(np.asarray(tangents(membrane, jnp.asarray(rest))), axis=0), np.eye(3)[:, :2])
         slid, (low, high) = rest[:, :2] + by, (rest[:, :2].min(axis=0), rest[:, :2].max(axis=0))
         inside = np.all((slid > low + 3e-3) & (slid < high - 3e-3), axis=1)
@@ -236,6 +236,6 @@ def test_nothing_slides_at_zero_over_a_sheet_that_was_bent_and_turned_at_rest(pl
         model = SheetModel(energy=undisturbed(mesh, DECLARATION), tool=plain.tool, view=centred(turned))
         there = dataclasses.replace(moment, rest=jnp.asarray(turned))
         for theta in (0.0, 1e-12):
-            view = EFFECTS["point_slip"].acts(model, jnp.full(2, theta), there).view
+            view = EFFECTS["point_slip"].acts(model, jnp.full(3, theta), there).view
             seen = view(moment.now, tangents=tangents(model.term(TriangleMembrane), moment.now))
             np.testing.assert_allclose(seen, moment.now, atol=1e-9)

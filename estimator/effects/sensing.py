@@ -10,6 +10,8 @@ from jiggle_mj.estimator.membrane import TriangleMembrane
 
 SMALL_ANGLE = 1e-3
 """[rad]."""
+BEGAN_SD = 2.0
+"""Of when a drift began, from when the sheet lay as its rest shape has it [s]."""
 EDGE = 1e-6
 """How far what slides may go beyond the edge, so that at rest it may go either way [m]."""
 
@@ -44,9 +46,10 @@ def _camera_bias(model: SheetModel, theta: Float[Array, " 6"], moment: Moment) -
     return _moved(model, theta[:3], theta[3:])
 
 
-def _camera_drift(model: SheetModel, theta: Float[Array, " 6"], moment: Moment) -> SheetModel:
-    """The same, growing with time."""
-    return _moved(model, moment.time * theta[:3], moment.time * theta[3:])
+def _camera_drift(model: SheetModel, theta: Float[Array, " 7"], moment: Moment) -> SheetModel:
+    """The same, growing with time from when it began."""
+    lasted = _since(theta[6], moment)
+    return _moved(model, lasted * theta[:3], lasted * theta[3:6])
 
 
 def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], moment: Moment) -> SheetModel:
@@ -56,13 +59,18 @@ def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], moment: Moment) -
     return eqx.tree_at(lambda one: one.view.shift, larger, larger.view.shift + (1 - factor) * theta[1:])
 
 
-def _point_slip(model: SheetModel, theta: Float[Array, " 2"], moment: Moment) -> SheetModel:
-    """What is followed slides over the sheet, more and more, at most to the edge of the rectangle around it."""
+def _point_slip(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
+    """What is followed slides over the sheet since it began to, at most to the edge of the rectangle around it."""
     membrane = model.term(TriangleMembrane)
     place = across(membrane, moment.rest, moment.rest)
     low, high = extent(place)
-    to = jnp.clip(place + moment.time * theta[None], low - EDGE, high + EDGE)
+    to = jnp.clip(place + _since(theta[2], moment) * theta[None, :2], low - EDGE, high + EDGE)
     return eqx.tree_at(lambda one: one.view.followed, model, Followed.at(jnp.asarray(membrane.vertices), place, to))
+
+
+def _since(began: Float[Array, ""], moment: Moment) -> Float[Array, ""]:
+    """How long it has lasted [s]."""
+    return jnp.maximum(moment.time - began, 0.0)
 
 
 def _at_another_time(model: SheetModel, moment: Moment, later: Float[Array, ""]) -> SheetModel:
@@ -159,8 +167,8 @@ SENSING = (
     Effect(
         name="camera_drift",
         acts=_camera_drift,
-        units=("m/s", "m/s", "m/s", "rad/s", "rad/s", "rad/s"),
-        prior_sd=(3e-4, 3e-4, 3e-4, 3e-3, 3e-3, 3e-3),
+        units=("m/s", "m/s", "m/s", "rad/s", "rad/s", "rad/s", "s"),
+        prior_sd=(3e-4, 3e-4, 3e-4, 3e-3, 3e-3, 3e-3, BEGAN_SD),
         source="an arm that sinks by millimetres in ten seconds",
         confounded_with=("point_slip", "camera_bias"),
         sensing=True,
@@ -178,8 +186,8 @@ SENSING = (
     Effect(
         name="point_slip",
         acts=_point_slip,
-        units=("m/s", "m/s"),
-        prior_sd=(2e-4, 2e-4),
+        units=("m/s", "m/s", "s"),
+        prior_sd=(2e-4, 2e-4, BEGAN_SD),
         source="a tracker that loses millimetres in ten seconds",
         confounded_with=("camera_drift",),
         sensing=True,
