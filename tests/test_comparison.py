@@ -56,6 +56,12 @@ def test_the_best_explains_much_and_foretells_well():
     assert behind(sharp, likely) == "gravity is likelier by 100 nat"
 
 
+def test_without_parts_left_out_the_likeliest_is_the_best():
+    likely, less = trial("gravity", 300.0), trial("stretch", 200.0)
+    assert best([less, likely]) is likely
+    assert behind(less, likely) == "gravity is likelier by 100 nat"
+
+
 @pytest.mark.parametrize(
     ("name", "gain", "error", "told"),
     [

@@ -28,7 +28,8 @@ def best(passed: list[Trial]) -> Trial:
 
 def behind(one: Trial, best: Trial) -> str:
     """Why an effect is neither added nor named beside the best."""
-    if one.log_bayes_factor > best.log_bayes_factor or best.missed < AS_GOOD * one.missed:
+    explains_more = one.log_bayes_factor > best.log_bayes_factor
+    if best.folds and (explains_more or best.missed < AS_GOOD * one.missed):
         return f"{best.effect.name} foretells better, to {1e3 * best.missed:.2f} mm against {1e3 * one.missed:.2f}"
     return f"{best.effect.name} is likelier by {best.log_bayes_factor - one.log_bayes_factor:.0f} nat"
 

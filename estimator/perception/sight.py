@@ -69,10 +69,12 @@ class Sight:
             PerceptionError: it shows nothing, or shows no sheet and the jaws are closed.
         """
         if observation.images is not None and self._stereo is not None:
-            if self._sheet is None and (passed_over := self._lay_over(observation.images, observation.tool)):
-                return passed_over
-            self._still_times = self._still_times or [observation.time]
-            return None
+            if self._sheet is not None:
+                return None
+            passed_over = self._lay_over(observation.images, observation.tool)
+            if passed_over is None:
+                self._still_times = [observation.time]
+            return passed_over
         if observation.points is None:
             raise PerceptionError(
                 f"observation {observation.index} has neither points nor images with a calibrated camera."
