@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from jiggle_mj.estimator.attribution import search
-from jiggle_mj.estimator.attribution.comparison import against, behind, best, not_told_from
+from jiggle_mj.estimator.attribution.comparison import against, behind, best, not_told_from, outdone
 from jiggle_mj.estimator.attribution.held_out import Foretold
 from jiggle_mj.estimator.attribution.leftover import Leftover
 from jiggle_mj.estimator.attribution.problem import Problem
@@ -98,6 +98,13 @@ def test_what_cannot_be_told_from_the_best(name, gain, error, told):
 def test_what_is_not_added_and_why(one, why):
     said = against(one, stage(1.0, 1.0, 1.0, 1.0, left=20.0))
     assert said is None if why is None else why in (said or "")
+
+
+@pytest.mark.parametrize(("gain", "added"), [(230.0, True), (220.0, False)])
+def test_what_is_far_less_likely_than_one_that_is_refused_is_not_added_in_its_place(gain, added):
+    absurd = trial("bed", 900.0, 0.5, theta=4.0)
+    said = outdone(trial("stretch", gain, 0.5), [absurd, trial("friction", 20.0, 1.0), trial("gravity", 300.0, 1.0)])
+    assert said is None if added else said == "gravity is likelier by 80 nat, and refused itself"
 
 
 def test_what_accounts_for_all_that_was_left_over_need_only_foretell_no_worse():

@@ -18,6 +18,9 @@ CERTAIN, LITTLE = 30.0, 20.0
 """Log Bayes factor from which, and what it leaves to larger errors up to which, an effect need not foretell better, but
 no worse: what is felt in one grasp alone cannot be foretold by others [nat]."""
 
+OUTDONE = 0.75
+"""Share of the log Bayes factor of one that is refused up to which a less likely effect is not added in its place."""
+
 
 def best(passed: list[Trial]) -> Trial:
     """The one with most nats over the fourth root of its error."""
@@ -48,6 +51,18 @@ def not_told_from(one: Trial, best: Trial) -> bool:
         return one.missed * CONFUSED <= best.missed
     lead = LEAD if len(one.at) > len(best.at) else max(LEAD, (1 - EXPLAINED) * best.log_bayes_factor)
     return likelier < lead and one.missed * AS_GOOD <= best.missed
+
+
+def outdone(one: Trial, refused: list[Trial]) -> str | None:
+    """Why an effect is not added where a far likelier one foretells too badly to be; None if there is none such.
+
+    What is wrong is then something like that one, of which this explains a little.
+    """
+    for other in refused:
+        if other.sensible and one.log_bayes_factor < OUTDONE * other.log_bayes_factor:
+            lead = other.log_bayes_factor - one.log_bayes_factor
+            return f"{other.effect.name} is likelier by {lead:.0f} nat, and refused itself"
+    return None
 
 
 def against(best: Trial, stage: Stage) -> str | None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jiggle_mj.estimator.attribution.comparison import against, behind, best, not_told_from
+from jiggle_mj.estimator.attribution.comparison import against, behind, best, not_told_from, outdone
 from jiggle_mj.estimator.attribution.fit import Fitted, fit, moved
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.attribution.scores import bayes_factor
@@ -112,6 +112,7 @@ def _tried(
             break
         tried = judged(problem, trial, used, say)
         why = against(replace(tried, log_bayes_factor=tried.log_bayes_factor + head_start), yardstick)
+        why = why or outdone(tried, [other for other, _ in refused])
         if why is None:
             passed.append(tried)
         else:
