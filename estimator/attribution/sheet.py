@@ -11,6 +11,7 @@ from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
 from jiggle_mj.estimator.membrane import TriangleMembrane
+from jiggle_mj.estimator.side_by_side import side_by_side
 
 GRIPPED = 1e6
 """Precision with which the grip carries what it holds while a state is predicted [1/m^2]."""
@@ -142,18 +143,21 @@ def predict_all(
     only: list[int] | None = None,
     by_tool: bool = False,
 ) -> tuple[Float[np.ndarray, "frames n 3"], Float[np.ndarray, "frames n 3"]]:
-    """Every frame in turn, from the states known so far; and how they are seen, NaN where they were not predicted."""
-    states, seen = states.copy(), np.full(states.shape, np.nan)
-    for k in range(len(history.frames)) if only is None else only:
-        one = history.frames[k]
-        found = predict(
-            sheet,
-            jnp.asarray(theta),
-            jnp.asarray(s),
-            one.frame,
-            history.moment(k, states),
-            jnp.asarray(states[k]),
-            jnp.asarray(by_tool),
-        )
-        states[k], seen[k] = np.asarray(found.x), np.asarray(found.seen)
-    return states, seen
+    """Every frame, from the states known so far; and how they are seen, NaN where they were not predicted.
+
+    Those of a part in turn, and the parts side by side: what an effect may know of other parts is what was known.
+    """
+    frames = range(len(history.frames)) if only is None else only
+    parts = {part: [k for k in frames if history.frames[k].part == part] for part in {f.part for f in history.frames}}
+    found, seen, theta, s = states.copy(), np.full(states.shape, np.nan), jnp.asarray(theta), jnp.asarray(s)
+
+    def one(part: int) -> None:
+        known = states.copy()
+        for k in parts[part]:
+            frame, moment = history.frames[k].frame, history.moment(k, known)
+            there = predict(sheet, theta, s, frame, moment, jnp.asarray(known[k]), jnp.asarray(by_tool))
+            known[k] = found[k] = np.asarray(there.x)
+            seen[k] = np.asarray(there.seen)
+
+    side_by_side(one, parts)
+    return found, seen

@@ -48,6 +48,8 @@ class ForceBalance(eqx.Module):
     tethered: Tethered
     neighbours: Int[Array, "n p"]
     """Particles coupled to each, itself included, padded with n."""
+    back: Int[Array, "n p"]
+    """Which of each neighbour's own neighbours the particle is; anything where there is none."""
     slots: tuple[Int[Array, "_m _p _p"], ...]
     """Where each term's Hessian windows go in the rows of H."""
     layout: Layout
@@ -83,6 +85,7 @@ class ForceBalance(eqx.Module):
         neighbours = neighbour_table(mesh.adjacency)
         position = {(i, j): k for i, row in enumerate(neighbours.tolist()) for k, j in enumerate(row) if j >= 0}
         width = neighbours.shape[1]
+        back = [[position.get((j, i), 0) for j in row] for i, row in enumerate(neighbours.tolist())]
         slots = tuple(
             jnp.asarray([[[i * width + position[i, j] for j in element] for i in element] for element in vertices])
             for vertices in (np.asarray(term.vertices).tolist() for term in energy.terms)
@@ -93,6 +96,7 @@ class ForceBalance(eqx.Module):
             energy=energy,
             tethered=Tethered.build(energy),
             neighbours=jnp.asarray(np.where(neighbours < 0, mesh.n, neighbours)),
+            back=jnp.asarray(back),
             slots=slots,
             layout=layout,
             places=jnp.asarray(layout.pair_index(neighbours)),
@@ -281,8 +285,9 @@ class ForceBalance(eqx.Module):
 
     def _transposed(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """H^T v."""
-        parts = jnp.einsum("npij,ni->npj", rows, v)
-        return jnp.zeros((len(v) + 1, 3), v.dtype).at[self.neighbours].add(parts)[:-1]
+        flipped = rows[self.neighbours, self.back]
+        padded = jnp.concatenate([v, jnp.zeros((1, 3), v.dtype)])
+        return jnp.einsum("npji,npj->ni", flipped, padded[self.neighbours])
 
     def apply(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """H v."""
