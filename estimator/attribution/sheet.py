@@ -149,13 +149,14 @@ def predict_all(
     """
     frames = range(len(history.frames)) if only is None else only
     parts = {part: [k for k in frames if history.frames[k].part == part] for part in {f.part for f in history.frames}}
-    found, seen, theta, s = states.copy(), np.full(states.shape, np.nan), jnp.asarray(theta), jnp.asarray(s)
+    found, seen = states.copy(), np.full(states.shape, np.nan)
+    at, stiffnesses, told = jnp.asarray(theta), jnp.asarray(s), jnp.asarray(by_tool)
 
     def one(part: int) -> None:
         known = states.copy()
         for k in parts[part]:
             frame, moment = history.frames[k].frame, history.moment(k, known)
-            there = predict(sheet, theta, s, frame, moment, jnp.asarray(known[k]), jnp.asarray(by_tool))
+            there = predict(sheet, at, stiffnesses, frame, moment, jnp.asarray(known[k]), told)
             known[k] = found[k] = np.asarray(there.x)
             seen[k] = np.asarray(there.seen)
 
