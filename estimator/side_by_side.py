@@ -1,4 +1,4 @@
-"""Frames that do not need each other, on all usable cores: compiled code and BLAS leave the interpreter to others."""
+"""What does not need each other on all usable cores: compiled code and BLAS leave the interpreter to others."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,13 +11,13 @@ from jiggle_mj.worker_processes import usable_cores
 T = TypeVar("T")
 
 
-def side_by_side(of: Callable[[int], T], frames: Iterable[int]) -> dict[int, T]:
-    """What a function gives for each frame, in their order."""
-    frames, wide = list(frames), jax.config.read("jax_enable_x64")
+def side_by_side(of: Callable[[int], T], keys: Iterable[int]) -> dict[int, T]:
+    """What a function gives for each, in their order."""
+    keys, wide = list(keys), jax.config.read("jax_enable_x64")
 
     def one(k: int) -> T:
         with jax.enable_x64(wide):  # which is said by thread
             return of(k)
 
     with ThreadPoolExecutor(usable_cores()) as pool:
-        return dict(zip(frames, pool.map(one, frames), strict=True))
+        return dict(zip(keys, pool.map(one, keys), strict=True))

@@ -17,7 +17,7 @@ from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.attribution.fit import doubted, fit, moved
 from jiggle_mj.estimator.attribution.gather import assumed, gather
 from jiggle_mj.estimator.attribution.scores import bayes_factor
-from jiggle_mj.estimator.attribution.sheet import closed_on, held_way
+from jiggle_mj.estimator.attribution.sheet import closed_on, held_way, predict_all
 from jiggle_mj.estimator.attribution.still_noise import measure
 from jiggle_mj.estimator.attribution.suggestion import suggest, told_apart
 from jiggle_mj.estimator.attribution.trials import jackknife_sd
@@ -150,6 +150,22 @@ def test_all_frames_are_compiled_for_as_one(light):
         moments = [history.moment(k, states) for k in range(len(states))]
     kinds = {tuple((leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(one)) for one in moments}
     assert len(kinds) == 1
+
+
+def test_grasps_are_predicted_side_by_side_and_the_frames_of_each_in_turn(light):
+    """With friction, which knows where the frame before it ended."""
+    problem, point = light[0].problem, light[0].stages[0].fitted.point
+    theta, history = point.theta.copy(), problem.history
+    theta[problem.sheet.place("friction")] = 0.5
+    with jax.enable_x64(True), one_thread():
+        together, _ = predict_all(problem.sheet, theta, point.s, history, point.states)
+        states = point.states
+        for k in range(len(history.frames)):
+            states, _ = predict_all(problem.sheet, theta, point.s, history, states, only=[k])
+        np.testing.assert_array_equal(together, states)
+        alone, _ = predict_all(problem.sheet, theta, point.s, history, point.states, only=[1])
+    assert history.frames[0].grasp == history.frames[1].grasp
+    assert np.abs(alone[1] - together[1]).max() > 1e-6
 
 
 def test_nothing_is_named_where_nothing_is_missing():

@@ -89,7 +89,10 @@ def test_what_cannot_be_told_from_the_best(name, gain, error, told):
         (trial("gravity", 25.0, 0.98, 0.98, 0.98, 0.98, left=10.0), "0.98 mm with it and 1.00 mm without"),
         (trial("gravity", 45.0, 0.98, 0.98, 0.98, 0.98, left=15.0), None),  # certain, and leaves little
         (trial("gravity", 45.0, 0.98, 0.98, 0.98, 0.98, left=25.0), "0.98 mm with it and 1.00 mm without"),
-        (trial("gravity", 45.0, 1.01, 1.01, 0.99, 0.99), "1.00 mm with it and 1.00 mm without, better in 2 of 4"),
+        (trial("gravity", 45.0, 1.5, 1.01, 0.99, 0.99), None),  # certain: one part aside
+        (trial("gravity", 45.0, 1.5, 1.05, 0.99, 0.99), "1.15 mm with it and 1.00 mm without, better in 2 of 4"),
+        (trial("gravity", 45.0, 1.5, 1.01, 0.99, 0.99, left=25.0), "1.14 mm with it and 1.00 mm without"),
+        (trial("gravity", 45.0, 1.01, 1.01, 1.01, 0.5), "0.91 mm with it and 1.00 mm without, better in 1 of 4"),
         (trial("gravity", 15.0, 0.9, 0.9, 0.9, 0.9), "larger errors without a cause explain"),
         (trial("gravity", 15.0, 0.7, 0.7, 0.7, 0.7), None),  # foretelling decides
         (trial("gravity", 300.0, 0.5, 0.5, 0.5, 0.5, theta=4.0), "beyond 3.5 prior standard deviations"),
@@ -109,9 +112,30 @@ def test_what_is_far_less_likely_than_one_that_is_refused_is_not_added_in_its_pl
 
 def test_what_accounts_for_all_that_was_left_over_need_only_foretell_no_worse():
     before = stage(1.0, 1.0, left=100.0)
-    assert against(trial("gravity", 300.0, 0.99, 0.99, left=20.0), before) is None
+    assert against(trial("gravity", 300.0, 0.99, 0.99, left=40.0), before) is None
     assert against(trial("gravity", 300.0, 0.99, 0.99, left=80.0), before) is not None
-    assert against(trial("gravity", 300.0, 1.01, 1.01, left=20.0), before) is not None
+    assert against(trial("gravity", 300.0, 1.01, 1.01, left=40.0), before) is not None
+
+
+def test_of_two_parts_none_is_put_aside():
+    assert against(trial("gravity", 45.0, 1.5, 0.99), stage(1.0, 1.0, left=20.0)) is not None
+
+
+def test_what_another_explains_makes_none_certain():
+    weak = trial("tool_scale", 15.0, 1.5, 0.99, 0.99, 0.99)
+    assert "1.14 mm with it" in (against(weak, stage(1.0, 1.0, 1.0, 1.0, left=20.0), head_start=300.0) or "")
+
+
+@pytest.mark.parametrize(("first_mm", "passed"), [(1.1, []), (0.9, ["gravity", "stretch"])])
+def test_until_one_is_better_none_is_added_in_place_of_a_far_likelier_one(monkeypatch, first_mm, passed):
+    trials = [trial("gravity", 90.0, first_mm), trial("friction", 85.0, 1.1), trial("stretch", 60.0, 0.9)]
+    monkeypatch.setattr(search, "fitted_trials", lambda *_: trials)
+    monkeypatch.setattr(search, "judged", lambda problem, one, used, say: one)
+    before = stage(1.0, left=20.0)
+    found, refused = search._tried(object.__new__(Problem), before, [(before, 0.0)], [], set(), lambda said: None)
+    assert [one.effect.name for one in found] == passed
+    assert refused[-1][0].effect.name == ("friction" if passed else "stretch")
+    assert passed or "gravity is likelier by 30 nat" in refused[-1][1]
 
 
 def test_each_but_the_last_is_compared_again_with_what_was_tried_in_its_place(monkeypatch):

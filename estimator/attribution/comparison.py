@@ -16,8 +16,8 @@ BETTER, DECISIVE = 0.97, 0.8
 over or is certain, and from which on it need not beat larger errors without a cause."""
 CERTAIN, LITTLE = 30.0, 20.0
 """Log Bayes factor from which, and what it leaves to larger errors up to which, an effect need not foretell better, but
-no worse: what is felt in one grasp alone cannot be foretold by others [nat]."""
-
+no worse, one part aside if there are more than two [nat]: what is felt in one grasp alone cannot be foretold by others,
+and a part that is missed by far, for attachments that only it would show, outweighs the rest."""
 OUTDONE = 0.75
 """Share of the log Bayes factor of one that is refused up to which a less likely effect is not added in its place."""
 
@@ -65,20 +65,32 @@ def outdone(one: Trial, refused: list[Trial]) -> str | None:
     return None
 
 
-def against(best: Trial, stage: Stage) -> str | None:
-    """Why an effect is not added; None if it is."""
+def against(best: Trial, stage: Stage, head_start: float = 0.0) -> str | None:
+    """Why an effect is not added; None if it is.
+
+    Against a stage than which the one that it is added to is likelier by `head_start` [nat].
+    """
     assert best.left is not None and best.folds is not None
     if not best.sensible:
         return f"its size is beyond {ABSURD:g} prior standard deviations"
-    before, after = (Foretold.together(parts).rms if parts else 1.0 for parts in (stage.folds, best.folds))
-    if after > DECISIVE * before and best.log_bayes_factor + best.left.gain < stage.left.gain + ENTER:
+    before, after = _missed(stage.folds), _missed(best.folds)
+    likelier = best.log_bayes_factor + head_start + best.left.gain - stage.left.gain
+    if after > DECISIVE * before and likelier < ENTER:
         return "larger errors without a cause explain the frames as well"
-    better = sum(b.rms < a.rms for a, b in zip(stage.folds, best.folds, strict=True))
-    certain = best.log_bayes_factor > CERTAIN and best.left.gain < LITTLE
-    enough = 1.0 if certain or best.left.gain < REMAINDER < stage.left.gain else BETTER
-    if stage.folds and (after > enough * before or 2 * better < len(stage.folds)):
-        return (
-            f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
-            f"better in {better} of {len(stage.folds)}"
-        )
-    return None
+    parts = list(zip(stage.folds, best.folds, strict=True))
+    better = sum(b.rms < a.rms for a, b in parts)
+    said = (
+        f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
+        f"better in {better} of {len(parts)}"
+    )
+    enough = 1.0 if best.left.gain < REMAINDER < stage.left.gain else BETTER
+    if best.log_bayes_factor > CERTAIN and best.left.gain < LITTLE:
+        enough = 1.0
+        parts = sorted(parts, key=lambda pair: pair[1].rms / pair[0].rms)[: max(len(parts) - 1, 2)]
+        before, after = _missed([a for a, _ in parts]), _missed([b for _, b in parts])
+    return said if parts and (after > enough * before or 2 * better < len(stage.folds)) else None
+
+
+def _missed(parts: list[Foretold]) -> float:
+    """Root mean square error over some parts [m]; 1 without any."""
+    return Foretold.together(parts).rms if parts else 1.0

@@ -58,7 +58,7 @@ def following(
     and another does beside one that was refused here, or in the place of the last.
     """
     accepted = [one.trial for one in added]
-    passed, refused = _tried(problem, stage, stage, accepted, used, say)
+    passed, refused = _tried(problem, stage, [(stage, 0.0)], accepted, used, say)
     if passed:
         return [*added, _chosen(passed, refused)], []
     if stage.left.gain > REMAINDER:
@@ -95,15 +95,15 @@ def revised(problem: Problem, added: list[Added], used: set[int], say: Say) -> l
 def _tried(
     problem: Problem,
     stage: Stage,
-    yardstick: Stage,
+    yardsticks: list[tuple[Stage, float]],
     accepted: list[Trial],
     used: set[int],
     say: Say,
-    head_start: float = 0.0,
 ) -> tuple[list[Trial], Refused]:
-    """Effects added to a stage that are better than a yardstick, and those that are not.
+    """Effects added to a stage that are better than other stages, and those that are not.
 
-    By `head_start` the stage itself is likelier than the yardstick [nat].
+    Than each of these the stage is likelier by a head start [nat]. Until one is better, none is added in place of a far
+    likelier one.
     """
     passed: list[Trial] = []
     refused: Refused = []
@@ -111,13 +111,13 @@ def _tried(
         if passed and trial.log_bayes_factor < COMPARED * passed[0].log_bayes_factor:
             break
         tried = judged(problem, trial, used, say)
-        why = against(replace(tried, log_bayes_factor=tried.log_bayes_factor + head_start), yardstick)
-        why = why or outdone(tried, [other for other, _ in refused])
-        if why is None:
-            passed.append(tried)
-        else:
+        whys = [against(tried, yardstick, head_start) for yardstick, head_start in yardsticks]
+        whys += [] if passed else [outdone(tried, [other for other, _ in refused])]
+        if why := next(filter(None, whys), None):
             refused.append((tried, why))
             say(f"{trial.effect.name} refused: {why}")
+        else:
+            passed.append(tried)
     return passed, refused
 
 
@@ -140,8 +140,8 @@ def _two(
         trial=first, rivals=[], others=[(other, behind(other, first)) for other in firsts if other is not first]
     )
     accepted = [*(other.trial for other in before), first]
-    passed, _ = _tried(problem, one.stage, yardstick, accepted, used, say, first.log_bayes_factor + head_start)
-    passed = [two for two in passed if against(two, one.stage) is None]
+    yardsticks = [(yardstick, first.log_bayes_factor + head_start), (one.stage, 0.0)]
+    passed, _ = _tried(problem, one.stage, yardsticks, accepted, used, say)
     return [one, _chosen(passed, [])] if passed else []
 
 

@@ -143,22 +143,24 @@ def predict_all(
     only: list[int] | None = None,
     by_tool: bool = False,
 ) -> tuple[Float[np.ndarray, "frames n 3"], Float[np.ndarray, "frames n 3"]]:
-    """Every frame, from the states known so far; and how they are seen, NaN where they were not predicted.
+    """Every frame, and how it is seen, NaN where it was not predicted.
 
-    Those of a part in turn, and the parts side by side: what an effect may know of other parts is what was known.
+    Those of a grasp in turn, from the states known so far, and the grasps side by side: of other grasps an effect knows
+    `states`, not what is found here.
     """
-    frames = range(len(history.frames)) if only is None else only
-    parts = {part: [k for k in frames if history.frames[k].part == part] for part in {f.part for f in history.frames}}
+    grasps: dict[int, list[int]] = {}
+    for k in range(len(history.frames)) if only is None else only:
+        grasps.setdefault(history.frames[k].grasp, []).append(k)
     found, seen = states.copy(), np.full(states.shape, np.nan)
     at, stiffnesses, told = jnp.asarray(theta), jnp.asarray(s), jnp.asarray(by_tool)
 
-    def one(part: int) -> None:
+    def one(grasp: int) -> None:
         known = states.copy()
-        for k in parts[part]:
+        for k in grasps[grasp]:
             frame, moment = history.frames[k].frame, history.moment(k, known)
             there = predict(sheet, at, stiffnesses, frame, moment, jnp.asarray(known[k]), told)
             known[k] = found[k] = np.asarray(there.x)
             seen[k] = np.asarray(there.seen)
 
-    side_by_side(one, parts)
+    side_by_side(one, grasps)
     return found, seen
