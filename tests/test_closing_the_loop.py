@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.attribution import fit as fitting
+from jiggle_mj.estimator.attribution import sheet as predicting
 from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
 from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.attribution.fit import doubted, fit, moved
 from jiggle_mj.estimator.attribution.gather import assumed, gather
+from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.attribution.scores import bayes_factor
 from jiggle_mj.estimator.attribution.sheet import closed_on, held_way, predict_all
 from jiggle_mj.estimator.attribution.still_noise import measure
@@ -166,6 +168,24 @@ def test_grasps_are_predicted_side_by_side_and_the_frames_of_each_in_turn(light)
         alone, _ = predict_all(problem.sheet, theta, point.s, history, point.states, only=[1])
     assert history.frames[0].grasp == history.frames[1].grasp
     assert np.abs(alone[1] - together[1]).max() > 1e-6
+
+
+@pytest.mark.slow
+def test_what_creeps_is_predicted_until_it_stays(monkeypatch):
+    """Anchors that follow what they hold, in the frame itself too: from rest, as from what was predicted so."""
+    creep = tuple(effect for effect in LIBRARY if effect.name == "anchor_creep")
+    problem = Problem.build(gather(DECLARATION, None, seen(1.0)), creep)
+    theta, s = np.zeros(problem.sheet.size), 0.3 * attached()
+    theta[problem.sheet.place("anchor_creep")] = 3.0
+    rest = np.array([sheet().rest for _ in problem.history.frames])
+    lift, off = [k for k, one in enumerate(problem.history.frames) if one.grasp == 1], {}
+    with jax.enable_x64(True), one_thread():
+        for rounds in (1, 12):
+            monkeypatch.setattr(predicting, "ROUNDS", rounds)
+            once, _ = predict_all(problem.sheet, theta, s, problem.history, rest, only=lift)
+            again, _ = predict_all(problem.sheet, theta, s, problem.history, once, only=lift)
+            off[rounds] = np.abs(again - once).max()
+    assert off[12] < 2 * predicting.STAYS < 0.2 * off[1], off
 
 
 def test_nothing_is_named_where_nothing_is_missing():

@@ -16,6 +16,9 @@ from jiggle_mj.estimator.side_by_side import side_by_side
 GRIPPED = 1e6
 """Precision with which the grip carries what it holds while a state is predicted [1/m^2]."""
 
+ROUNDS, STAYS = 4, 1e-5
+"""How often a frame is predicted at most with an effect that lingers, and how little it moves when it stays [m]."""
+
 
 class Sheet(eqx.Module):
     """One sheet and what it may lack."""
@@ -152,15 +155,20 @@ def predict_all(
     for k in range(len(history.frames)) if only is None else only:
         grasps.setdefault(history.frames[k].grasp, []).append(k)
     found, seen = states.copy(), np.full(states.shape, np.nan)
+    rounds = ROUNDS if any(one.lingers and np.any(theta[sheet.place(one.name)]) for one in sheet.library) else 1
     at, stiffnesses, told = jnp.asarray(theta), jnp.asarray(s), jnp.asarray(by_tool)
 
     def one(grasp: int) -> None:
         known = states.copy()
         for k in grasps[grasp]:
-            frame, moment = history.frames[k].frame, history.moment(k, known)
-            there = predict(sheet, at, stiffnesses, frame, moment, jnp.asarray(known[k]), told)
-            known[k] = found[k] = np.asarray(there.x)
-            seen[k] = np.asarray(there.seen)
+            frame = history.frames[k].frame
+            for _ in range(rounds):
+                there = predict(sheet, at, stiffnesses, frame, history.moment(k, known), jnp.asarray(known[k]), told)
+                gone = np.abs(np.asarray(there.x) - known[k]).max()
+                known[k] = found[k] = np.asarray(there.x)
+                seen[k] = np.asarray(there.seen)
+                if gone < STAYS:
+                    break
 
     side_by_side(one, grasps)
     return found, seen

@@ -35,6 +35,8 @@ class Effect:
     """Effects that often look like it, and attachments that do."""
     non_negative: bool = False
     """Whether parameters below 0 make no sense."""
+    lingers: bool = False
+    """Whether it depends on where the sheet is in the frame itself by `Moment.past`: predicted until that stays."""
     sensing: bool = False
     """Whether it is of the tool, the camera or the tracker, so that it holds for one session alone."""
 

@@ -116,6 +116,7 @@ MEMORY = (
         source="skin loses half of its stress within the first second, and creeps for minutes",
         confounded_with=("material_damping", "friction"),
         non_negative=True,
+        lingers=True,
     ),
     Effect(
         name="anchor_creep",
@@ -125,6 +126,7 @@ MEMORY = (
         source="loose fascia gives within seconds",
         confounded_with=("attachments", "tissue_creep"),
         non_negative=True,
+        lingers=True,
     ),
     Effect(
         name="material_damping",
