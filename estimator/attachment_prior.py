@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from jiggle_mj.estimator.mesh import neighbour_table, symmetric
+from jiggle_mj.estimator.mesh import neighbour_table, places_back, symmetric
 from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
 
 
@@ -39,13 +39,12 @@ class AttachmentPrior(eqx.Module):
     ) -> "AttachmentPrior":
         """For n particles; `probability` is that of one none of whose neighbours is attached."""
         table = neighbour_table(symmetric(n, edges))
-        back = np.argmax(table[table] == np.arange(n)[:, None, None], axis=2)
         return cls(
             stiffness=stiffness,
             log_odds=jnp.full(n, np.log(probability) - np.log1p(-probability)),
             coupling=jnp.asarray(coupling, dtype=float),
             neighbours=jnp.asarray(np.where(table < 0, n, table)),
-            back=jnp.asarray(back),
+            back=jnp.asarray(places_back(table)),
         )
 
     def parted(

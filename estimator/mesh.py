@@ -107,6 +107,11 @@ def neighbour_table(near: sp.csr_matrix) -> Int[np.ndarray, "n p"]:
     return table
 
 
+def places_back(table: Int[np.ndarray, "n p"]) -> Int[np.ndarray, "n p"]:
+    """Which place a row has in the rows that a symmetric `neighbour_table` names in it; anything where there is none."""
+    return np.argmax(table[table] == np.arange(len(table))[:, None, None], axis=2)
+
+
 def far_apart(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " _count"]:
     """Indices of points far from one another, each the farthest from those before; begins far from the middle."""
     chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]

@@ -1,5 +1,6 @@
 """What a recording's frames with closed jaws hold, for fits over all of them at once."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -66,6 +67,13 @@ class History:
         told = {grasp: [told for one in frames if one.grasp == grasp for told in one.reports] for grasp in set(grasps)}
         longest = max(len(one) for one in told.values())
         self._reports = {grasp: _padded(one, longest) for grasp, one in told.items()}
+
+    def by(self, of: Callable[[Timed], int], frames: Iterable[int]) -> dict[int, list[int]]:
+        """Some frames, sorted by their grasp, say."""
+        found: dict[int, list[int]] = {}
+        for k in frames:
+            found.setdefault(of(self.frames[k]), []).append(k)
+        return found
 
     def moment(self, k: int, states: Float[np.ndarray, "frames n 3"] | Float[Array, "frames n 3"]) -> Moment:
         """What an effect may know of frame k."""

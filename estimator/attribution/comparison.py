@@ -54,7 +54,7 @@ def not_told_from(one: Trial, best: Trial) -> bool:
 
 
 def outdone(one: Trial, refused: list[Trial]) -> str | None:
-    """Why an effect is not added where a far likelier one foretells too badly to be; None if there is none such.
+    """Why an effect is not added where a far likelier one was refused; None if there is none such.
 
     What is wrong is then something like that one, of which this explains a little.
     """
@@ -79,16 +79,16 @@ def against(best: Trial, stage: Stage, head_start: float = 0.0) -> str | None:
         return "larger errors without a cause explain the frames as well"
     parts = list(zip(stage.folds, best.folds, strict=True))
     better = sum(b.rms < a.rms for a, b in parts)
-    said = (
-        f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
-        f"better in {better} of {len(parts)}"
-    )
-    enough = 1.0 if best.left.gain < REMAINDER < stage.left.gain else BETTER
-    if best.log_bayes_factor > CERTAIN and best.left.gain < LITTLE:
-        enough = 1.0
-        parts = sorted(parts, key=lambda pair: pair[1].rms / pair[0].rms)[: max(len(parts) - 1, 2)]
-        before, after = _missed([a for a, _ in parts]), _missed([b for _, b in parts])
-    return said if parts and (after > enough * before or 2 * better < len(stage.folds)) else None
+    certain = best.log_bayes_factor > CERTAIN and best.left.gain < LITTLE
+    enough = 1.0 if certain or best.left.gain < REMAINDER < stage.left.gain else BETTER
+    counted = sorted(parts, key=lambda pair: pair[1].rms / pair[0].rms)[: max(len(parts) - 1, 2)] if certain else parts
+    worse = _missed([b for _, b in counted]) > enough * _missed([a for a, _ in counted])
+    if parts and (worse or 2 * better < len(parts)):
+        return (
+            f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
+            f"better in {better} of {len(parts)}"
+        )
+    return None
 
 
 def _missed(parts: list[Foretold]) -> float:

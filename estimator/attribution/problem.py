@@ -77,10 +77,7 @@ class Problem:
 
     def by_part(self, frames: Iterable[int]) -> dict[int, list[int]]:
         """Frames sorted by part."""
-        by_part: dict[int, list[int]] = {}
-        for k in frames:
-            by_part.setdefault(self.history.frames[k].part, []).append(k)
-        return by_part
+        return self.history.by(lambda one: one.part, frames)
 
     def free(self, named: np.ndarray) -> np.ndarray:
         """Named parameters, and the sheet's own."""

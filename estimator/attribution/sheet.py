@@ -151,9 +151,7 @@ def predict_all(
     Those of a grasp in turn, from the states known so far, and the grasps side by side: of other grasps an effect knows
     `states`, not what is found here.
     """
-    grasps: dict[int, list[int]] = {}
-    for k in range(len(history.frames)) if only is None else only:
-        grasps.setdefault(history.frames[k].grasp, []).append(k)
+    grasps = history.by(lambda one: one.grasp, range(len(history.frames)) if only is None else only)
     found, seen = states.copy(), np.full(states.shape, np.nan)
     rounds = ROUNDS if any(one.lingers and np.any(theta[sheet.place(one.name)]) for one in sheet.library) else 1
     at, stiffnesses, told = jnp.asarray(theta), jnp.asarray(s), jnp.asarray(by_tool)
@@ -164,10 +162,10 @@ def predict_all(
             frame = history.frames[k].frame
             for _ in range(rounds):
                 there = predict(sheet, at, stiffnesses, frame, history.moment(k, known), jnp.asarray(known[k]), told)
-                gone = np.abs(np.asarray(there.x) - known[k]).max()
-                known[k] = found[k] = np.asarray(there.x)
-                seen[k] = np.asarray(there.seen)
-                if gone < STAYS:
+                x = np.asarray(there.x)
+                stays = np.abs(x - known[k]).max() < STAYS
+                known[k], found[k], seen[k] = x, x, np.asarray(there.seen)
+                if stays:
                     break
 
     side_by_side(one, grasps)
