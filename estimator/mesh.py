@@ -108,7 +108,7 @@ def neighbour_table(near: sp.csr_matrix) -> Int[np.ndarray, "n p"]:
 
 
 def places_back(table: Int[np.ndarray, "n p"]) -> Int[np.ndarray, "n p"]:
-    """Which place a row has in each row that it names in a symmetric `neighbour_table`; anything where it names none."""
+    """Place of a row in each row that it names in a symmetric `neighbour_table`; anything where it names none."""
     return np.argmax(table[table] == np.arange(len(table))[:, None, None], axis=2)
 
 
