@@ -15,6 +15,7 @@ from jiggle_mj.scenes.scene import Camera
 from jiggle_mj.camera import StereoCamera, optical_from_opengl
 from jiggle_mj.errors import RenderError
 from jiggle_mj.observation import StereoPair
+from jiggle_mj.recording_schemas import as_recorded
 
 NAMES = ("left", "right")
 
@@ -50,7 +51,7 @@ def place_cameras(model: mujoco.MjModel, T_world_left: Float[np.ndarray, "4 4"],
 
 
 def stereo_camera(camera: Camera) -> StereoCamera:
-    """The calibration that belongs to the rendered images."""
+    """The calibration that belongs to the rendered images, as a recording of them has it."""
     T_world_opengl = np.eye(4)
     T_world_opengl[:3, :3], T_world_opengl[:3, 3] = _rotation(camera), _position(camera, "left")
     return StereoCamera.rectified(
@@ -58,7 +59,7 @@ def stereo_camera(camera: Camera) -> StereoCamera:
         height=camera.height,
         focal=0.5 * camera.height / math.tan(0.5 * math.radians(camera.fov_deg)),
         baseline=camera.baseline,
-        T_world_camera=optical_from_opengl(T_world_opengl),
+        T_world_camera=as_recorded(optical_from_opengl(T_world_opengl)),
     )
 
 

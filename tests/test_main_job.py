@@ -7,23 +7,6 @@ import pytest
 from jiggle_mj.eval.experiment import run_scene
 from jiggle_mj.eval.tables import MAIN, Row
 from jiggle_mj.scenes import load_scene
-from tiny_scene import SCENE, call
-
-SMALL = SCENE.replace("spacing = 7e-3", "spacing = 4.5e-3").replace("size = [0.06, 0.06]", "size = [0.07, 0.07]")
-
-
-@pytest.mark.render
-def test_a_disc_is_found_from_images_alone(tmp_path, monkeypatch, capsys):
-    """All that is reported lies within a ring of the disc and covers it within a ring; the report has pictures."""
-    scene = tmp_path / "small.toml"
-    scene.write_text(SMALL)
-    assert call(monkeypatch, "run", scene, "--out", tmp_path / "run", "--json") == 0
-    figures = json.loads(capsys.readouterr().out)
-    ring = figures["detection"]["by_dilation"]["1"]
-    assert ring["pcd"] >= 0.95 and ring["pug"] >= 0.95
-    assert figures["tracking"]["rms_m"] <= 0.6e-3
-    page = (tmp_path / "run" / "report.html").read_text()
-    assert "data:image/jpeg" in page and "Reliability of P(attached)" in page
 
 
 @pytest.mark.slow
