@@ -8,11 +8,32 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from jiggle_mj.errors import RecordingError
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns an OpenGL camera frame (y up, looking along -z; MuJoCo's) into an optical one, and back: it is its inverse."""
+
+
+QUATERNION_DECIMALS = 12
+"""Of a rotation as a recording states it, so that what is read can be stated as the same again."""
+
+
+def stated_rotation(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
+    """A rotation as a recording states it: a rounded quaternion wxyz."""
+    return Rotation.from_matrix(R).as_quat(scalar_first=True).round(QUATERNION_DECIMALS)
+
+
+def as_recorded(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """A pose to the bit as a recording gives it back.
+
+    Stated and read twice, as a rounded quaternion is of unit length only to its last decimal.
+    """
+    read = T.copy()
+    for _ in range(2):
+        read[:3, :3] = Rotation.from_quat(stated_rotation(read[:3, :3]), scalar_first=True).as_matrix()
+    return read
 
 
 def optical_from_opengl(T_world_opengl: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

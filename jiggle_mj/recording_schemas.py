@@ -21,14 +21,12 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from jiggle_mj.camera import CameraCalibration
+from jiggle_mj.camera import CameraCalibration, stated_rotation
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.observation import UNTURNED, ToolState
 
 WORLD = "world"
 CAMERA_FRAMES = {"left": "camera_left_optical", "right": "camera_right_optical"}
-QUATERNION_DECIMALS = 12
-"""Of the rotation that a matrix is written as, so that what is read can be written as the same again."""
 FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 """zlib level 1: a third of the time of the default for a tenth more bytes; the MCAP chunk is compressed besides."""
 
@@ -157,20 +155,9 @@ def parse_calibration(message: CalibrationMessage, topic: str) -> CameraCalibrat
 def frame_transform(parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]) -> FrameTransform:
     """The pose of a child frame in its parent, at time 0."""
     message = FrameTransform(timestamp=timestamp(0), parent_frame_id=parent, child_frame_id=child)
-    quat_wxyz = Rotation.from_matrix(T_parent_child[:3, :3]).as_quat(scalar_first=True)
     _fill(message.translation, "xyz", T_parent_child[:3, 3])
-    _fill(message.rotation, "wxyz", quat_wxyz.round(QUATERNION_DECIMALS))
+    _fill(message.rotation, "wxyz", stated_rotation(T_parent_child[:3, :3]))
     return message
-
-
-def as_recorded(T_parent_child: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """A child frame's pose to the bit as a recording gives it back.
-
-    Written and read twice, as a rounded quaternion is of unit length only to its last decimal.
-    """
-    for _ in range(2):
-        T_parent_child = parse_transform(frame_transform(WORLD, "", T_parent_child))
-    return T_parent_child
 
 
 def parse_transform(message: FrameTransform | Pose) -> Float[np.ndarray, "4 4"]:

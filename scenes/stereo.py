@@ -12,10 +12,9 @@ from jiggle_mj.scenes.highlights import with_highlights
 from jiggle_mj.scenes.opengl import IMPORT_ERROR, no_opengl
 from jiggle_mj.scenes.scene import Camera
 
-from jiggle_mj.camera import StereoCamera, optical_from_opengl
+from jiggle_mj.camera import StereoCamera, as_recorded, optical_from_opengl
 from jiggle_mj.errors import RenderError
 from jiggle_mj.observation import StereoPair
-from jiggle_mj.recording_schemas import as_recorded
 
 NAMES = ("left", "right")
 

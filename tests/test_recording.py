@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-from jiggle_mj.camera import CameraCalibration, StereoCamera
+from jiggle_mj.camera import CameraCalibration, StereoCamera, as_recorded
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.mcap_files import McapOutput
 from jiggle_mj.observation import (
@@ -33,7 +33,6 @@ from jiggle_mj.recording_frames import camera_transforms
 from jiggle_mj.recording_moments import Stamped, group_moments
 from jiggle_mj.recording_schemas import (
     GRASP_SCHEMA,
-    as_recorded,
     calibration_message,
     decode_image,
     frame_transform,

@@ -75,12 +75,9 @@ class Sight:
             if passed_over is None:
                 self._still_times = [observation.time]
             return passed_over
-        if observation.points is None:
-            raise PerceptionError(
-                f"observation {observation.index} has neither points nor images with a calibrated camera."
-            )
+        points = _points(observation)
         if not (observation.tool.closed and self._still):
-            self._still.append(observation.points)
+            self._still.append(points)
             self._still_times.append(observation.time)
         return None
 
@@ -119,11 +116,8 @@ class Sight:
         """
         if observation.images is not None and self._stereo is not None:
             return self._stereo.track(observation.images, observation.tool, predicted=predicted)
-        if observation.points is None:
-            raise PerceptionError(f"observation {observation.index} has neither points nor images; one is needed.")
-        if self._clouds is not None:
-            return self._clouds.track(observation.points, *believed())
-        return self._points.track(observation.points)
+        points = _points(observation)
+        return self._points.track(points) if self._clouds is None else self._clouds.track(points, *believed())
 
     def _lay_over(self, images: StereoPair, tool: ToolState) -> str | None:
         """Lay the mesh over an image; one that cannot be used is passed over while another may come."""
@@ -147,3 +141,11 @@ class Sight:
         )
         self._clouds = CloudTracker(sheet, self._declaration)
         return sheet
+
+
+def _points(observation: Observation) -> MeasuredPoints:
+    if observation.points is None:
+        raise PerceptionError(
+            f"observation {observation.index} has neither points nor images with a calibrated camera; one is needed."
+        )
+    return observation.points
