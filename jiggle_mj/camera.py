@@ -25,6 +25,11 @@ def stated_rotation(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
     return Rotation.from_matrix(R).as_quat(scalar_first=True).round(QUATERNION_DECIMALS)
 
 
+def read_rotation(quat_wxyz: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation that a recording states; its quaternion may be of any length."""
+    return Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
+
+
 def as_recorded(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """A pose to the bit as a recording gives it back.
 
@@ -32,7 +37,7 @@ def as_recorded(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """
     read = T.copy()
     for _ in range(2):
-        read[:3, :3] = Rotation.from_quat(stated_rotation(read[:3, :3]), scalar_first=True).as_matrix()
+        read[:3, :3] = read_rotation(stated_rotation(read[:3, :3]))
     return read
 
 

@@ -19,9 +19,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.timestamp_pb2 import Timestamp
 from jaxtyping import Float, UInt8
-from scipy.spatial.transform import Rotation
 
-from jiggle_mj.camera import CameraCalibration, stated_rotation
+from jiggle_mj.camera import CameraCalibration, read_rotation, stated_rotation
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.observation import UNTURNED, ToolState
 
@@ -174,7 +173,7 @@ def parse_transform(message: FrameTransform | Pose) -> Float[np.ndarray, "4 4"]:
         quat_wxyz = UNTURNED
     refuse_bad_pose(position, quat_wxyz)
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
+    T[:3, :3] = read_rotation(quat_wxyz)
     T[:3, 3] = position
     return T
 

@@ -14,14 +14,14 @@ from tiny_scene import SCENE, call, scene_file
 FILES = {"run.mcap", "run.truth.mcap", "estimate.mcap", "result.json", "report.html"}
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+@pytest.fixture(scope="module", params=[pytest.param("stereo", marks=pytest.mark.render)])
+def whole(request, tmp_path_factory):
     """`run` on a tiny scene, from images: exit code, scene and folder."""
     folder = tmp_path_factory.mktemp("whole")
     monkeypatch = pytest.MonkeyPatch()
     scene, out = scene_file(folder, text=SCENE.replace("spacing = 7e-3", "spacing = 4.5e-3")), folder / "out"
     with monkeypatch.context() as patch:
-        code = call(patch, "run", scene, "--out", out)
+        code = call(patch, "run", scene, "--out", out, "--sensing", request.param)
     return code, scene, out
 
 
