@@ -49,6 +49,19 @@ class IsometricBending(Term):
         off = jnp.einsum("ha,hai->hi", self.weight, x) - self.curvature[:, None] * _normal(x, self.facing)
         return 0.5 * jnp.sum(off**2, axis=1)
 
+    def gradient(self, x: Float[Array, "h 4 3"]) -> Float[Array, "h 4 3"]:
+        """[N]."""
+        edge, across = _sides(x, self.facing)
+        normal = jnp.cross(edge, across)
+        length = jnp.linalg.norm(normal, axis=1, keepdims=True)
+        normal = normal / length
+        off = jnp.einsum("ha,hai->hi", self.weight, x) - self.curvature[:, None] * normal
+        turned = self.curvature[:, None] / length * (off - jnp.sum(off * normal, axis=1, keepdims=True) * normal)
+        of_edge, of_across = jnp.cross(across, turned), jnp.cross(turned, edge)
+        first, second = self.facing[:, :1] * of_across, self.facing[:, 1:] * of_across
+        direct = self.weight[:, :, None] * off[:, None, :]
+        return direct - jnp.stack([second - first - of_edge, of_edge, first, -second], axis=1)
+
     def bent(self, x: Float[Array, "h 4 3"]) -> Float[Array, " h"]:
         """The weighted sums along the normals: c where the hinges are at rest [J^(1/2)]."""
         return jnp.sum(jnp.einsum("ha,hai->hi", self.weight, x) * _normal(x, self.facing), axis=1)
@@ -60,10 +73,14 @@ class IsometricBending(Term):
 
 def _normal(x: Float[Array, "h 4 3"], facing: Float[Array, "h 2"]) -> Float[Array, "h 3"]:
     """Unit mean normal of a hinge's two triangles; with equal weights, the direction in which a bent hinge pulls."""
-    edge = x[:, 1] - x[:, 0]
-    first, second = jnp.cross(edge, x[:, 2] - x[:, 0]), jnp.cross(edge, x[:, 3] - x[:, 0])
-    normal = facing[:, :1] * first - facing[:, 1:] * second
+    normal = jnp.cross(*_sides(x, facing))
     return normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def _sides(x: Float[Array, "h 4 3"], facing: Float[Array, "h 2"]) -> tuple[Float[Array, "h 3"], Float[Array, "h 3"]]:
+    """Two vectors whose cross product is along the mean normal: the hinge's edge, and one across it."""
+    across = facing[:, :1] * (x[:, 2] - x[:, 0]) - facing[:, 1:] * (x[:, 3] - x[:, 0])
+    return x[:, 1] - x[:, 0], across
 
 
 def _cotangent(u: Float[np.ndarray, "h 3"], v: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, " h"]:

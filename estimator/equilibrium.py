@@ -107,8 +107,8 @@ def _minimise(energy, b, start, force_tolerance, max_steps):
             length, _ = trial
             return length / 2, energy.value_and_gradient(x + length / 2 * step, b)
 
-        first = (jnp.ones(()), energy.value_and_gradient(x + step, b))
-        length, (new, pull) = jax.lax.while_loop(too_far, halve, first)
+        untried = (2 * jnp.ones(()), (jnp.asarray(jnp.inf, value.dtype), gradient))
+        length, (new, pull) = jax.lax.while_loop(too_far, halve, untried)
         stuck = length <= 1e-8
         moved, new, pull = jax.tree.map(partial(jnp.where, stuck), (x, value, gradient), (x + length * step, new, pull))
         return moved, new, pull, count + 1, stuck

@@ -118,18 +118,25 @@ class Outlook(eqx.Module):
 
     def outcome(self, tug: Tug, s: Float[Array, " n"], *, informative: bool = True) -> Outcome:
         """Of a tug in a scenario; the gain costs as much as the rest, and is 0 where it is not asked for."""
-        balance, n = self.balance, len(s)
-        sight = jnp.broadcast_to(self.precision[None], (n, 3, 3))
-        grip = Evidence(y=tug.to, precision=sight, held=tug.held, loaded=tug.loaded)
-        x = balance.predict(jnp.where(tug.held[:, None], tug.to, tug.start), s, grip)
-        gain = jnp.zeros(())
-        if informative:
-            seen = eqx.tree_at(lambda one: one.y, grip, x)
-            frame = balance.linearise(x, s, seen)
-            gain = self.gain(balance.information(frame, balance.fit(frame)).precision)
-        b = balance.reference * s / (1 - s)
-        squared = jnp.sum((x - balance.energy.rest) ** 2, axis=1)
-        return Outcome(x=x, gain=gain, energy=0.5 * b @ squared / n, force=jnp.max(b * jnp.sqrt(squared)))
+        found = self.ending(tug, s)
+        return eqx.tree_at(lambda one: one.gain, found, self.shown(tug, s, found.x)) if informative else found
+
+    def ending(self, tug: Tug, s: Float[Array, " n"]) -> Outcome:
+        """Where a tug ends in a scenario and what it asks of the attachments; nothing is said of the gain."""
+        balance = self.balance
+        x = balance.predict(jnp.where(tug.held[:, None], tug.to, tug.start), s, self._seen(tug, tug.to))
+        b, squared = balance.reference * s / (1 - s), jnp.sum((x - balance.energy.rest) ** 2, axis=1)
+        force = jnp.max(b * jnp.sqrt(squared))
+        return Outcome(x=x, gain=jnp.zeros(()), energy=0.5 * b @ squared / len(s), force=force)
+
+    def shown(self, tug: Tug, s: Float[Array, " n"], x: Float[Array, "n 3"]) -> Float[Array, ""]:
+        """Gain by a look at where a tug ends in a scenario [nat]."""
+        frame = self.balance.linearise(x, s, self._seen(tug, x))
+        return self.gain(self.balance.information(frame, self.balance.fit(frame)).precision)
+
+    def _seen(self, tug: Tug, y: Float[Array, "n 3"]) -> Evidence:
+        precision = jnp.broadcast_to(self.precision[None], (len(y), 3, 3))
+        return Evidence(y=y, precision=precision, held=tug.held, loaded=tug.loaded)
 
 
 @eqx.filter_jit

@@ -294,8 +294,10 @@ class ForceBalance(eqx.Module):
     def _state_step(self, frame: "Frame", s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
         """Move of a frame's state for fixed s, with its factor; Gauss-Newton's if s is its own."""
         pull = jnp.einsum("nij,nj->ni", evidence.precision, evidence.y - frame.x)
-        weight = self._weight(frame.error, s, evidence)[:, None]
-        push = jax.vjp(lambda y: self.unbalanced(y, s), frame.x)[1](weight * self.unbalanced(frame.x, s))[0]
+        d, free = frame.x - self.energy.rest, (1 - s)[:, None]
+        unbalanced = self.reference * d - free * frame.slope
+        weighted = self._weight(frame.error, s, evidence)[:, None] * unbalanced
+        push = self.reference * weighted - self._transposed(frame.turn, free * weighted)
         return solve(self.layout, frame.factor, pull - push)
 
 
