@@ -1,8 +1,8 @@
 """Which actions a run takes: the scene's own programme, or those of a policy that looks at the estimate."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache, partial
-from itertools import chain
+from itertools import chain, takewhile
 from typing import TYPE_CHECKING
 
 from jiggle_mj.estimator import Estimator, EstimatorConfig
@@ -75,13 +75,20 @@ def check_goes_with(policy: Policy, config: EstimatorConfig) -> None:
         )
 
 
-def actions(scene: "Scene", policy: Policy | None, estimator: Estimator, steps: int | None = None) -> Iterator[Action]:
-    """What the tool does, in order: who does not choose its grasps is given the scene's first."""
+def actions(
+    scene: "Scene",
+    policy: Policy | None,
+    estimator: Estimator,
+    steps: int | None = None,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+) -> Iterator[Action]:
+    """What the tool does, in order, until `stop` says so: who does not choose its grasps is given the scene's first."""
     from jiggle_mj.scenes.programme import programme
 
-    if policy is None:
-        return programme(scene)
-    return chain(_beginning(scene, policy), policy.actions(estimator, steps=_most(policy, steps)))
+    first = programme(scene) if policy is None else _beginning(scene, policy)
+    first = takewhile(lambda _: not stop(), first)
+    return first if policy is None else chain(first, policy.actions(estimator, steps=_most(policy, steps), stop=stop))
 
 
 def acts(policy: Policy | None, estimator: Estimator) -> Json | None:
@@ -114,5 +121,6 @@ def _most(policy: Policy, steps: int | None) -> int:
 def _beginning(scene: "Scene", policy: Policy) -> Iterator[Action]:
     from jiggle_mj.scenes.programme import opening, still
 
-    chooses = isinstance(policy, Procedure) or (isinstance(policy, Information) and policy.regrasps)
-    return still(scene) if chooses else opening(scene)
+    if isinstance(policy, Information):
+        return still(scene) if policy.regrasps else opening(scene, height=0.0)
+    return still(scene) if isinstance(policy, Procedure) else opening(scene)

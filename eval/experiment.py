@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import Disparity, TissueMask
-from jiggle_mj.estimator.policies.policy import Decision
+from jiggle_mj.estimator.policies.policy import INTERRUPTED, Decision, Policy
 from jiggle_mj.eval.acting import actions, acts, check_goes_with, policy_named
 from jiggle_mj.eval.report import shown_steps, write_report
 from jiggle_mj.eval.score import IDENTITY, RECORDED, Json, read_scorable, result, score_read, write_result
@@ -33,11 +33,11 @@ from jiggle_mj.episode import (
     recording_identity,
     settings,
 )
-from jiggle_mj.errors import OutputError, RecordingError
+from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
 from jiggle_mj.estimate_recording import EstimateRecording, read_estimate
 from jiggle_mj.limits import Limits
 from jiggle_mj.mcap_files import truth_path
-from jiggle_mj.observation import StereoPair
+from jiggle_mj.observation import Grasp, StereoPair
 from jiggle_mj.recording import Recording
 from jiggle_mj.truth import Truth
 
@@ -61,6 +61,7 @@ def run_scene(
     disparity: Disparity | None = None,
     overwrite: bool = False,
     on_frame: OnFrame | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Json:
     """The main job: reference tissue, observations, estimate, score, report.
 
@@ -76,6 +77,7 @@ def run_scene(
         disparity: see `Estimator`.
         overwrite: replace an earlier run's files.
         on_frame: called after each frame.
+        stop: asked before each action; once it says so the run ends, and what was seen is judged and written.
 
     Returns:
         The content of result.json.
@@ -98,12 +100,17 @@ def run_scene(
         clear_directory(directory, own)
         said = "" if chooses is None else f"{policy}, {steps} steps, {settings(estimator.config)}"
         about = {RECORDED: scene.name, IDENTITY: recording_identity(scene, sensing, seed, said)}
-        does = actions(scene, chooses, estimator, steps)
+        does = actions(scene, chooses, estimator, steps, stop=stop)
         refused = None if chooses is None else chooses.refused
         frames = observe(
             reference, does, directory / RECORDING, seed=seed, policy=said, watch=watch, on_refused=refused
         )
-        episode = estimate(frames, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
+        try:
+            episode = estimate(frames, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
+        except PerceptionError as failure:
+            if chooses is None or any(isinstance(one.action, Grasp) for one in chooses.decisions):
+                raise
+            raise PerceptionError(f"the policy {policy} has ended, as {chooses.ended}: {failure}") from failure
     unscored = _result(
         episode,
         scene=scene.name,
@@ -115,7 +122,7 @@ def run_scene(
         simulation_s=watch.seconds,
         limits=scene.limits.limits(),
         decisions=[] if chooses is None else chooses.decisions,
-        ended=None if chooses is None else chooses.ended,
+        ended=_ended(chooses, interrupted=stop()),
         procedure=acts(chooses, estimator),
     )
     write_result(directory / RESULT, unscored)
@@ -204,6 +211,13 @@ def score_directory(
         say("the recording is not beside the truth: the report has no pictures; pass --recording for them")
     _report(directory, found, figures, recording=recording, truth=true)
     return figures
+
+
+def _ended(policy: Policy | None, *, interrupted: bool) -> str | None:
+    """Why a policy has ended; of the scene's programme, only that it did not get to its end."""
+    if policy is None:
+        return INTERRUPTED if interrupted else None
+    return policy.ended
 
 
 def _is_of(read: EstimateRecording, recording: Path) -> bool:

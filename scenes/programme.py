@@ -43,10 +43,10 @@ def still(scene: Scene) -> Iterator[Action]:
         yield Wait()
 
 
-def opening(scene: Scene) -> Iterator[Action]:
-    """Still frames, and the first point grasped and lifted by `OPENING`, so that nothing slides."""
+def opening(scene: Scene, *, height: float = OPENING) -> Iterator[Action]:
+    """Still frames, and the first point grasped and lifted [m], so that nothing slides."""
     yield from still(scene)
-    share = OPENING / scene.programme.height
+    share = height / scene.programme.height
     yield from islice(_lift(scene, grasp_points(scene)[0]), 1 + math.ceil(share * scene.programme.increments))
 
 

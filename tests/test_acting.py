@@ -1,6 +1,8 @@
 """Policies in closed loop with a small reference: what they do, what they keep to, and what they say at the end."""
 
+import itertools
 import json
+import signal
 from dataclasses import replace
 from itertools import islice, pairwise
 from typing import Any
@@ -8,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.estimator.policies import information
 from jiggle_mj.estimator.policies.information import LOST, Information
 from jiggle_mj.estimator.policies.policy import STEP, Policy
 from jiggle_mj.eval.acting import actions, check_goes_with, most_actions, policy_named
@@ -16,6 +19,7 @@ from jiggle_mj.scenes import Reference, load_scene, programme
 from result_keys import KEYS, keys
 from tiny_scene import SCENE, call, scene_file
 
+from jiggle_mj.cli.terminal import patient
 from jiggle_mj.errors import ActionError, OptionError
 from jiggle_mj.limits import Limits
 from jiggle_mj.observation import Action, Declaration, Grasp, Move, Release, Wait
@@ -105,6 +109,69 @@ def test_where_nothing_is_safe_nothing_is_grasped_and_it_says_so(scene):
     loop = Loop(scene, policy, steps=8)
     assert not any(isinstance(action, Grasp) for action in loop.done)
     assert policy.ended.startswith("no safe pull teaches ") and "not decided" in policy.ended
+
+
+def test_where_nothing_is_safe_the_command_says_why_nothing_was_estimated(tmp_path, monkeypatch, capsys):
+    unsafe = scene_file(tmp_path, text=SCENE + "[limits]\nforce = 1e-9\nenergy = 1e-20\n")
+    for policy, why in (
+        ("information", "no safe pull teaches "),
+        ("suture", "no stretch of "),
+    ):
+        arguments = ("--sensing", "particles", "--policy", policy, "--overwrite")
+        assert call(monkeypatch, "run", unsafe, "--out", tmp_path / "out", *arguments) == 1
+        assert f"the policy {policy} has ended, as {why}" in capsys.readouterr().err
+
+
+def test_ours_without_regrasping_closes_the_jaws_and_lifts_nothing_unasked(scene):
+    policy = policy_named("one-grasp", scene, seed=0)
+    assert policy is not None
+    first = list(islice(actions(scene, policy, Estimator(Declaration()), 5), 3))
+    assert [type(action) for action in first] == [Wait, Wait, Grasp]
+    assert most_actions(scene, "one-grasp", 5) == 3 + 5
+
+
+def test_a_grasp_from_which_little_is_to_be_learned_is_left(ours):
+    policy = Information(Limits(), radius=8e-3, seed=0, regrasps=False, enough=np.inf)
+    assert policy.plan(ours[1].estimator) == "little is left to learn"
+
+
+@pytest.mark.parametrize(("cost", "goes"), [(3, True), (1e9, False)])
+def test_another_place_is_worth_going_to_if_it_teaches_more_than_it_costs_to_get_there(ours, monkeypatch, cost, goes):
+    _, loop = ours
+    here = loop.estimator.tool.position + np.array([0, 0, STEP])
+    monkeypatch.setattr(information, "REGRASP", cost)
+    monkeypatch.setattr(Information, "_best_pull", lambda *_: (here, 1e-3))
+    action, why = Information(Limits(), radius=8e-3, seed=0, enough=0.0).plan(loop.estimator)
+    assert (why == "another place teaches more") is goes
+    assert isinstance(action, Move)
+    np.testing.assert_array_equal(action.to, loop.estimator.hold.tip if goes else here)
+
+
+def test_where_every_attachment_is_decided_enough_is_known(ours, monkeypatch):
+    _, loop = ours
+    opened = replace(loop.estimator.tool, closed=False)
+    monkeypatch.setattr(Estimator, "tool", property(lambda _: opened))
+    nothing = np.zeros(len(loop.estimator.sheet.rest), bool)
+    said = Information(Limits(), radius=8e-3, seed=0, about=nothing).plan(loop.estimator)
+    assert said == "enough is known: every P(attached) is below 0.05 or above 0.95"
+
+
+def test_a_run_that_is_told_to_stop_writes_what_it_has(scene, tmp_path):
+    asked = itertools.count()
+    figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", stop=lambda: next(asked) > 4)
+    assert figures["ended"] == "it was interrupted" and figures["n_frames"] == 5
+    assert figures["detection"]["n_attached"] > 0 and (tmp_path / "out" / "report.html").exists()
+
+
+def test_the_first_interrupt_is_a_wish_and_the_second_an_order():
+    before = signal.getsignal(signal.SIGINT)
+    with patient() as stopped:
+        assert not stopped()
+        signal.raise_signal(signal.SIGINT)
+        assert stopped()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_grasp_that_slipped_is_let_go(ours, monkeypatch):
@@ -208,7 +275,7 @@ def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, mon
         assert act["kind"] == "cut" and act["succeeded"] is not fails
         assert (act["log_bayes_factor"] > 0) is not fails
     assert done["cycles"] == 1 or fails
-    assert figures["ended"].startswith("all 60 steps" if fails else "nothing is attached any more")
+    assert figures["ended"].startswith("all 60 steps" if fails else "nothing is found attached any more")
 
 
 class Misses(Corners):

@@ -6,7 +6,7 @@ the policy is done, and then says why.
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,8 @@ from jiggle_mj.observation import Action, Grasp, Move
 
 STEP = 5e-3
 """Gamma: longest way of the tip from one look at the tissue to the next, with tissue in the jaws [m]."""
+INTERRUPTED = "it was interrupted"
+"""How a policy has ended that was told to stop."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,14 +75,22 @@ class Policy(ABC):
         self.ended = f"an action could not be carried out: {error}"
         return False
 
-    def actions(self, estimator: Estimator, *, steps: int) -> Iterator[Action]:
-        """At most `steps` actions; an interrupted plan (Ctrl-C) is the end of them, and what was seen is kept."""
+    def actions(
+        self, estimator: Estimator, *, steps: int, stop: Callable[[], bool] = lambda: False
+    ) -> Iterator[Action]:
+        """At most `steps` actions, and none once `stop` says so.
+
+        An interrupted plan (Ctrl-C) is the end of them too, and what was seen is kept.
+        """
         for _ in range(steps):
+            if stop():
+                self.ended = INTERRUPTED
+                return
             began = time.perf_counter()
             try:
                 planned = self.plan(estimator)
             except KeyboardInterrupt:
-                planned = "it was interrupted"
+                planned = INTERRUPTED
             if isinstance(planned, str):
                 self.ended = planned
                 return

@@ -23,12 +23,12 @@ CYCLE = 40
 CHECKED = 0.002
 """A gain for which no step is worth taking once something was cut [nat per particle]."""
 CERTAIN = 20.0
-"""Log Bayes factor, either way, from which an act is known to have worked or failed. A model that errs exaggerates it:
-a lift that shows the place gives 55 and more."""
+"""Log Bayes factor, either way, from which an act is known to have worked or failed: far, as a model that errs
+exaggerates it."""
 ROOM = 2.4
 """Width of a cut [spacings]: the particles on its path and a ring around them, as well as an attachment is located."""
-FREE = 0.2
-"""P(attached) up to which a place is free enough to be sewn."""
+FREE = 0.05
+"""P(attached) up to which a place is known to be free. Inside a sheet of which nothing was seen it is 0.11."""
 
 
 class Procedure(Policy):
@@ -87,7 +87,7 @@ class Detach(Procedure):
         """See `Procedure.act`."""
         found = estimator.detection.attached
         if not found.any():
-            return "nothing is attached any more"
+            return f"nothing is found attached{' any more' if self.acts else ''}"
         mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
         return Cut(path=tour(mesh.rest[found, :2]), width=ROOM * mesh.spacing)
 

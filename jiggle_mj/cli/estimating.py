@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.table import Table
 
 from jiggle_mj.cli.options import AsJson, Disturb, FilterName, Name, Out, PathArgument, Sensing
-from jiggle_mj.cli.terminal import console, progress, show
+from jiggle_mj.cli.terminal import console, patient, progress, show, stop
 from jiggle_mj.policies import PolicyName
 
 
@@ -49,7 +49,7 @@ def run(
     from jiggle_mj.scenes import disturbed, load_scene
 
     loaded, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)
-    with progress(most_actions(loaded, policy, steps), f"run {loaded.name}") as on_frame:
+    with patient() as stopped, progress(most_actions(loaded, policy, steps), f"run {loaded.name}") as on_frame:
         figures = run_scene(
             loaded,
             out,
@@ -60,8 +60,11 @@ def run(
             config=config,
             overwrite=overwrite,
             on_frame=on_frame,
+            stop=stopped,
         )
     show(figures, out, as_json)
+    if stopped():
+        stop(f"interrupted; what was seen until then is in {out}", 130)
 
 
 def estimate(

@@ -1,10 +1,12 @@
 """What goes to stderr: progress, figures in a few lines, and why it stopped."""
 
 import json
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
 from rich.console import Console
@@ -28,6 +30,24 @@ def stop(failure: object, code: int) -> NoReturn:
     """Say why in red, and leave."""
     console.print(f"jiggle-mj: {failure}", style="red", markup=False, highlight=False, soft_wrap=True)
     sys.exit(code)
+
+
+@contextmanager
+def patient() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C is noted, for who asks, and what is under way comes to its end; the second stops at once."""
+    noted: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        if noted:
+            raise KeyboardInterrupt
+        noted.append(number)
+        say("interrupted: what is under way comes to its end, and the results are written; again stops at once")
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(noted)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
