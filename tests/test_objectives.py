@@ -34,6 +34,17 @@ def test_uwd_is_the_norm_of_the_papers_matrix(state):
     assert uncertainty_weighted_displacement(x, rest, covariance) == pytest.approx(expected)
 
 
+def test_a_pull_that_displaces_more_may_teach_less():
+    """A particle shows its stiffness by as much as it moves: one that moves by 2 against three that move by 1 each."""
+    known = jnp.eye(3)
+    one, three = jnp.diag(jnp.array([2.0, 0.0, 0.0])), jnp.eye(3)
+    displaced = [uncertainty_weighted_displacement(x, jnp.zeros((3, 3)), known) for x in (one, three)]
+    entropy = [log_shrinkage(jnp.zeros((3, 3, 3)).at[:, :, 0].set(x), known, 1.0) for x in (one, three)]
+    assert displaced[0] > displaced[1]
+    np.testing.assert_allclose(entropy, [-np.log(5), -3 * np.log(2)])
+    assert entropy[0] > entropy[1]
+
+
 def test_the_boundary_energy_is_that_of_its_springs(state):
     x, rest, b, _ = state
     pull = jax.grad(boundary_energy)(x, rest, b)
