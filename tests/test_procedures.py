@@ -73,7 +73,7 @@ class Seen(Estimator):
     @property
     def detection(self):
         free = np.zeros(sheet().n)
-        return Detection(attached=free > 0, score=free, stiffness=free, stiffness_sd=free, rule="nothing is")
+        return Detection(attached=free > 0, score=free, stiffness=free, stiffness_sd=free, rule="", probabilistic=True)
 
     def release(self):
         pass

@@ -114,7 +114,9 @@ class Sew(Procedure):
                 return "whether the suture holds could not be seen"
             return "the suture holds" if factor > 0 else "the suture does not hold"
         mesh, detection = SheetMesh(estimator.sheet.rest, estimator.sheet.faces), estimator.detection
-        path = free_stretch(mesh.rest[:, :2], detection.score, mesh.border, length=self._length, width=self._width)
+        path = None
+        if detection.probabilistic:  # else no frame has said anything yet
+            path = free_stretch(mesh.rest[:, :2], detection.score, mesh.border, length=self._length, width=self._width)
         if path is None:
             return f"no stretch of {1e3 * self._length:.0f} mm is known to be free"
         return Suture(path=path, width=self._width, stiffness=self._stiffness)
