@@ -107,7 +107,7 @@ def _minimise(energy, b, start, force_tolerance, max_steps):
             length, _ = trial
             return length / 2, energy.value_and_gradient(x + length / 2 * step, b)
 
-        untried = (2 * jnp.ones(()), (jnp.asarray(jnp.inf, value.dtype), gradient))
+        untried = (2 * jnp.ones(()), (jnp.full_like(value, jnp.inf), gradient))
         length, (new, pull) = jax.lax.while_loop(too_far, halve, untried)
         stuck = length <= 1e-8
         moved, new, pull = jax.tree.map(partial(jnp.where, stuck), (x, value, gradient), (x + length * step, new, pull))

@@ -117,10 +117,14 @@ class Outlook(eqx.Module):
         return jnp.sum(jnp.where(self.about, expected_fall(self.mixture, noise), 0.0))
 
     def outcome(self, tug: Tug, s: Float[Array, " n"], *, informative: bool = True) -> Outcome:
-        """Of a tug in a scenario; the gain costs as much as the rest, and is 0 where it is not asked for."""
+        """Of a tug in a scenario; the gain costs as much as the rest, and is 0 where it is not asked for.
+
+        Two programs, so that what is the same with and without the gain is compiled once.
+        """
         found = self.ending(tug, s)
         return eqx.tree_at(lambda one: one.gain, found, self.shown(tug, s, found.x)) if informative else found
 
+    @eqx.filter_jit
     def ending(self, tug: Tug, s: Float[Array, " n"]) -> Outcome:
         """Where a tug ends in a scenario and what it asks of the attachments; nothing is said of the gain."""
         balance = self.balance
@@ -129,6 +133,7 @@ class Outlook(eqx.Module):
         force = jnp.max(b * jnp.sqrt(squared))
         return Outcome(x=x, gain=jnp.zeros(()), energy=0.5 * b @ squared / len(s), force=force)
 
+    @eqx.filter_jit
     def shown(self, tug: Tug, s: Float[Array, " n"], x: Float[Array, "n 3"]) -> Float[Array, ""]:
         """Gain by a look at where a tug ends in a scenario [nat]."""
         frame = self.balance.linearise(x, s, self._seen(tug, x))

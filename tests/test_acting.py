@@ -235,6 +235,7 @@ def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, mo
     assert figures["timing"]["plan_s"] > 0 and figures["safety"]["limit_n"] == 1e-5
     safety = figures["safety"]
     assert safety["force_violations"] > 0 and safety["max_force_n"] > 1e-5
+    assert (safety["violations"] > 0) == (safety["max_mean_boundary_energy_j"] > safety["limit_j"])
     assert safety["limit_j"] == 1e-7
     assert figures["procedure"] is None
 

@@ -37,6 +37,7 @@ def test_the_surest_free_stretch_lies_where_nothing_is_attached():
 def test_where_nothing_is_known_to_be_free_there_is_none():
     before = eqx.filter_jit(lambda belief: belief.sweep(belief.gaussian()).mixture().attached)(sheet_prior())
     assert stretch(np.asarray(before)) is None, "nothing was seen yet"
+    assert stretch(np.full(sheet().n, 0.3)) is None
     assert stretch(np.full(sheet().n, 0.0)) is not None
 
 

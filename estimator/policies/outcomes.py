@@ -19,7 +19,7 @@ def outcomes(outlook: Outlook, tugs: Tug, s: Float[Array, "scenarios n"], *, inf
     if jax.default_backend() != "cpu":
         return at_once(outlook, tugs, s, informative=informative)
     each_tug = [jax.tree.map(lambda leaf, i=i: leaf[i], tugs) for i in range(len(tugs.to))]
-    found = [[_in_turn(outlook, tug, one, informative=informative) for one in s] for tug in each_tug]
+    found = [[_outcome(outlook, tug, one, informative=informative) for one in s] for tug in each_tug]
     stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *row) for row in found]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked)
 
@@ -44,30 +44,13 @@ def _dealt(outlook: Outlook, pulls: Tug, s: Float[Array, "batch n"], *, informat
 
     def some(known: Outlook, pulls: Tug, s: Float[Array, "some n"]) -> Outcome:
         whole = eqx.combine(known, rest)
-        each = jax.vmap(lambda pull, one: whole.outcome(pull, _felt(pull, one), informative=informative))
-        return each(pulls, s)
+        return jax.vmap(lambda pull, one: _outcome(whole, pull, one, informative=informative))(pulls, s)
 
     mesh, dealt, everywhere = Mesh(np.array(devices), ("pairs",)), PartitionSpec("pairs"), PartitionSpec()
     shared = jax.shard_map(some, mesh=mesh, in_specs=(everywhere, dealt, dealt), out_specs=dealt, check_vma=False)
     return shared(known, pulls, s)
 
 
-def _in_turn(outlook: Outlook, tug: Tug, s: Float[Array, " n"], *, informative: bool) -> Outcome:
-    """In two programs, so that what is the same with and without the gain is compiled once."""
-    found = _ending(outlook, tug, s)
-    return eqx.tree_at(lambda one: one.gain, found, _shown(outlook, tug, s, found.x)) if informative else found
-
-
-@eqx.filter_jit
-def _ending(outlook: Outlook, tug: Tug, s: Float[Array, " n"]) -> Outcome:
-    return outlook.ending(tug, _felt(tug, s))
-
-
-@eqx.filter_jit
-def _shown(outlook: Outlook, tug: Tug, s: Float[Array, " n"], x: Float[Array, "n 3"]) -> Float[Array, ""]:
-    return outlook.shown(tug, _felt(tug, s), x)
-
-
-def _felt(tug: Tug, s: Float[Array, " n"]) -> Float[Array, " n"]:
+def _outcome(outlook: Outlook, tug: Tug, s: Float[Array, " n"], *, informative: bool) -> Outcome:
     """What is held by the jaws is not held by attachments."""
-    return jnp.where(tug.loaded, 0.0, s)
+    return outlook.outcome(tug, jnp.where(tug.loaded, 0.0, s), informative=informative)
