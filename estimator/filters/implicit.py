@@ -18,7 +18,7 @@ from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Stated, Update
-from jiggle_mj.estimator.filters.force_balance import ForceBalance, Information
+from jiggle_mj.estimator.filters.force_balance import Fit, ForceBalance, Frame, Information
 from jiggle_mj.estimator.filters.noise import Misfit, Noise
 from jiggle_mj.estimator.mesh import SheetMesh
 from jiggle_mj.estimator.side_by_side import side_by_side
@@ -70,7 +70,8 @@ class ImplicitFilter(Filter):
         """See `Filter.update`."""
         s = belief.bounded(b)
         noisy = evidence.widened(self._noise.position)
-        update, found = _update(self.balance, belief, s, noisy, start)
+        frame, _, found = _seen(self.balance, _settled(self.balance, start, s, noisy), s, noisy)
+        update = _believed(self.balance, belief, frame, found, noisy)
         if np.isfinite(update.x).all() and np.isfinite(update.b).all():
             if self._between:
                 self._grasps.append(_Grasp())
@@ -205,7 +206,9 @@ class _Grasp:
 
         def one(k: int) -> tuple[Float[Array, "n 3"], Information, Misfit]:
             evidence, x, _ = self.frames[k]
-            return _information(balance, x, s, evidence.widened(noise.position))
+            noisy = evidence.widened(noise.position)
+            frame, fit, found = _seen(balance, x, s, noisy)
+            return frame.x, found, _misfit(balance, frame, fit, noisy)
 
         for k, (x, found, misfit) in side_by_side(one, range(len(self.frames))).items():
             grasp.take(self.frames[k][0], x, found)
@@ -214,31 +217,39 @@ class _Grasp:
 
 
 @eqx.filter_jit
-def _update(
-    balance: ForceBalance,
-    belief: AttachmentBelief,
-    s: Float[Array, " n"],
-    evidence: Evidence,
-    start: Float[Array, "n 3"],
-) -> tuple[Update, Information]:
-    frame = balance.approach(balance.settle(start, s, evidence), s, evidence)
-    found = balance.information(frame, balance.fit(frame))
+def _settled(
+    balance: ForceBalance, start: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
+) -> Float[Array, "n 3"]:
+    return balance.settle(start, s, evidence)
+
+
+@eqx.filter_jit
+def _seen(
+    balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
+) -> tuple[Frame, Fit, Information]:
+    """What a frame says, from a state nearby."""
+    frame = balance.approach(x, s, evidence)
+    fit = balance.fit(frame)
+    return frame, fit, balance.information(frame, fit)
+
+
+@eqx.filter_jit
+def _misfit(balance: ForceBalance, frame: Frame, fit: Fit, evidence: Evidence) -> Misfit:
+    return balance.misfit(frame, fit, evidence)
+
+
+@eqx.filter_jit
+def _believed(
+    balance: ForceBalance, belief: AttachmentBelief, frame: Frame, found: Information, evidence: Evidence
+) -> Update:
+    """The belief with what a frame says, and the state by it."""
     belief = belief.add(found.precision, found.shift)
     gaussian = belief.gaussian()
     nis = _normalised_innovation(found, gaussian.factor, evidence)
     belief = belief.sweep(gaussian)
     stated = _stated(belief, frame.converged)
     x = balance.polish(frame, belief.bounded(stated.b), evidence)
-    return Update(**vars(stated), x=x, nis=nis), found
-
-
-@eqx.filter_jit
-def _information(
-    balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
-) -> tuple[Float[Array, "n 3"], Information, Misfit]:
-    frame = balance.approach(x, s, evidence)
-    fit = balance.fit(frame)
-    return frame.x, balance.information(frame, fit), balance.misfit(frame, fit, evidence)
+    return Update(**vars(stated), x=x, nis=nis)
 
 
 @eqx.filter_jit
