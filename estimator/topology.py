@@ -59,11 +59,20 @@ def after(belief: AttachmentBelief, event: Cut | Suture, region: Bool[np.ndarray
     What was sewn is about as stiff as was meant if it holds. That is said as one measurement of s, so wide that free is
     not ruled out by it; what it says of free against attached is taken back from the odds.
     """
-    attached, where = belief.mixture().attached, jnp.asarray(region)
-    if isinstance(event, Cut):
-        return belief.changed(where, jnp.clip(FAILS * attached, LEAST, 1 - LEAST))
+    where = jnp.asarray(region)
+    return _cut(belief, where) if isinstance(event, Cut) else _sewn(belief, where, jnp.asarray(event.stiffness))
+
+
+@eqx.filter_jit
+def _cut(belief: AttachmentBelief, where: Bool[Array, " n"]) -> AttachmentBelief:
+    return belief.changed(where, jnp.clip(FAILS * belief.mixture().attached, LEAST, 1 - LEAST))
+
+
+@eqx.filter_jit
+def _sewn(belief: AttachmentBelief, where: Bool[Array, " n"], stiffness: Float[Array, ""]) -> AttachmentBelief:
+    attached = belief.mixture().attached
     changed = belief.changed(where, jnp.clip(1 - FAILS * (1 - attached), LEAST, 1 - LEAST))
-    meant = belief.bounded(jnp.full(len(region), event.stiffness))
+    meant = belief.bounded(jnp.full(len(where), stiffness))
     odds = changed.prior.log_odds
     _, factor = changed.prior.stiffness.posterior(meant, meant**2, odds)
     changed = eqx.tree_at(lambda one: one.prior.log_odds, changed, jnp.where(where, odds - factor, odds))

@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,10 @@ STIFFNESS = SpikeAndSlab.build(spike=3e-3, rungs=RUNGS, spread=SPREAD, even=1e12
 """So sure of its shares that nothing is learned."""
 PROBABILITY, REFERENCE = 0.1, 30.0
 
+posterior = eqx.filter_jit(AttachmentBelief.posterior)
+moments = eqx.filter_jit(AttachmentBelief.moments)
+interval = eqx.filter_jit(AttachmentBelief.interval)
+
 
 def chain(n: int, *, coupling: float) -> AttachmentBelief:
     """Particles in a row, nothing seen."""
@@ -25,6 +30,7 @@ def chain(n: int, *, coupling: float) -> AttachmentBelief:
     return AttachmentBelief.before(prior, reference=REFERENCE)
 
 
+@eqx.filter_jit
 def refined(belief: AttachmentBelief, sweeps: int) -> AttachmentBelief:
     return jax.lax.fori_loop(0, sweeps, lambda _, one: one.sweep(one.gaussian()), belief)
 
@@ -32,7 +38,8 @@ def refined(belief: AttachmentBelief, sweeps: int) -> AttachmentBelief:
 def alone(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Moments of particles without neighbours, measured independently."""
     odds = jnp.full(len(mean), logit(PROBABILITY))
-    means, variances = STIFFNESS.posterior(jnp.asarray(mean), jnp.asarray(variance), odds)[0].moments()
+    mixture, _ = eqx.filter_jit(STIFFNESS.posterior)(jnp.asarray(mean), jnp.asarray(variance), odds)
+    means, variances = eqx.filter_jit(mixture.moments)()
     return np.asarray(means), np.asarray(variances)
 
 
@@ -41,9 +48,9 @@ def test_independent_measurements_give_each_particle_its_own_posterior(monkeypat
     mean, variance = np.array([0.0, 0.02, 0.15, 0.9]), np.array([1e-5, 1e-4, 1e-4, 1e-2])
     belief = refined(chain(4, coupling=0.0).add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)), 30)
     expected, spread = alone(mean, variance)
-    posterior = belief.posterior()
-    np.testing.assert_allclose(posterior.mean, expected, rtol=1e-6)
-    np.testing.assert_allclose(posterior.sd**2, spread, rtol=1e-6)
+    found = posterior(belief)
+    np.testing.assert_allclose(found.mean, expected, rtol=1e-6)
+    np.testing.assert_allclose(found.sd**2, spread, rtol=1e-6)
 
 
 def test_odds_along_a_chain_are_exact():
@@ -60,7 +67,7 @@ def test_odds_along_a_chain_are_exact():
         weight = np.exp(a @ (logit(PROBABILITY) + factor) + coupling * np.sum(a[1:] * a[:-1]))
         total += weight
         attached += weight * a
-    np.testing.assert_allclose(belief.posterior().attached, attached / total, rtol=1e-6)
+    np.testing.assert_allclose(posterior(belief).attached, attached / total, rtol=1e-6)
 
 
 def test_two_particles_that_share_a_load():
@@ -76,18 +83,18 @@ def test_two_particles_that_share_a_load():
     joint = np.exp(-0.5 * (s[:, None] + s[None] - total) ** 2 / variance) * prior[:, None] * prior[None]
     joint /= np.trapezoid(np.trapezoid(joint, s, axis=1), s)
     expected = np.trapezoid(np.trapezoid(joint, s, axis=1) * s, s)
-    posterior = belief.posterior()
-    np.testing.assert_allclose(posterior.mean, expected, rtol=0.05)
-    np.testing.assert_allclose(posterior.mean.sum(), total, atol=0.01)
+    found = posterior(belief)
+    np.testing.assert_allclose(found.mean, expected, rtol=0.05)
+    np.testing.assert_allclose(found.mean.sum(), total, atol=0.01)
     spread = np.sqrt(np.trapezoid(np.trapezoid(joint, s, axis=1) * (s - expected) ** 2, s))
-    assert (spread < np.asarray(posterior.sd)).all() and (np.asarray(posterior.sd) < 2 * spread).all()
+    assert (spread < np.asarray(found.sd)).all() and (np.asarray(found.sd) < 2 * spread).all()
 
 
 def test_what_nothing_was_seen_of_stays_at_the_prior():
     belief = chain(3, coupling=0.0)
     seen = refined(belief.add(jnp.diag(jnp.array([1e6, 0.0, 0.0])), jnp.array([1e5, 0.0, 0.0])), 30)
-    assert float(seen.posterior().attached[0]) > 0.99
-    np.testing.assert_allclose(seen.posterior().attached[1:], PROBABILITY, rtol=1e-6)
+    assert float(posterior(seen).attached[0]) > 0.99
+    np.testing.assert_allclose(posterior(seen).attached[1:], PROBABILITY, rtol=1e-6)
     assert float(belief.entropy()) > float(seen.entropy())
 
 
@@ -95,13 +102,13 @@ def test_an_attached_neighbour_raises_the_odds():
     """One that is certain multiplies them by e^J."""
     coupling = 1.2
     belief = refined(chain(2, coupling=coupling).add(jnp.diag(jnp.array([1e6, 0.0])), jnp.array([3e5, 0.0])), 60)
-    assert float(belief.posterior().attached[1]) == pytest.approx(expit(logit(PROBABILITY) + coupling), rel=1e-6)
+    assert float(posterior(belief).attached[1]) == pytest.approx(expit(logit(PROBABILITY) + coupling), rel=1e-6)
 
 
 def test_intervals_open_upwards_where_only_a_lower_end_is_known():
     mean, sd = np.array([0.0, 0.1, 0.99]), np.array([1e-3, 5e-3, 5e-2])
     belief = refined(chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2)), 30)
-    lower, upper = (np.asarray(end) for end in belief.interval())
+    lower, upper = (np.asarray(end) for end in interval(belief))
     assert lower[0] == 0 and upper[0] < REFERENCE * 0.01
     assert lower[1] < REFERENCE * 0.1 / 0.9 < upper[1] < np.inf
     assert lower[2] > 4 * REFERENCE and upper[2] == np.inf
@@ -115,9 +122,9 @@ def test_what_the_mesh_moves_widens_each_and_leaves_sums_alone(monkeypatch):
     for moved in (0.0, 1 / 3):
         monkeypatch.setattr(attachment_belief, "MOVED", moved)
         jax.clear_caches()
-        stated.append((np.asarray(belief.moments()[1]), belief.posterior().sd, belief.interval()))
+        stated.append((np.asarray(moments(belief)[1]), posterior(belief).sd, interval(belief)))
     (sharp, sharp_sd, sharp_interval), (wide, wide_sd, wide_interval) = stated
-    s = np.asarray(belief.moments()[0])
+    s = np.asarray(moments(belief)[0])
     first, second = ((s[i] + s[i + 1]) / 2 * (1 - (s[i] + s[i + 1]) / 2) / 3 for i in (0, 1))
     edges = np.array([[1, -1, 0], [0, 1, -1]]) * np.array([[first], [second]])
     np.testing.assert_allclose(wide - sharp, edges.T @ edges, atol=1e-12)

@@ -131,7 +131,7 @@ def test_a_belief_takes_over_what_the_samples_say():
     belief = AttachmentBelief.before(prior(), reference=30.0).add(jnp.asarray(precision), jnp.asarray(shift))
     belief, agree = eqx.filter_jit(belief.sampled)(jax.random.key(1), burn_in=2, rounds=jnp.asarray(ROUNDS))
     weight, mean, variance = summed(0.06)
-    posterior = belief.posterior()
+    posterior = eqx.filter_jit(belief.posterior)()
     assert agree
     np.testing.assert_allclose(posterior.attached, 1 - weight[0], atol=0.02)
     np.testing.assert_allclose(posterior.mean, np.clip(mean, 0, 1), atol=0.05 * np.sqrt(variance).max())

@@ -39,8 +39,8 @@ def test_information_equals_the_dense_formula(balance):
     found = information(balance, jnp.asarray(x), jnp.asarray(s), seen)
 
     free, each = np.repeat(~frame.held, 3), np.repeat(s, 3)
-    internal = np.asarray(sheet_energy().internal_gradient(jnp.asarray(x)))
-    stiff = dense(sheet_energy().layout, sheet_energy().hessian(jnp.asarray(x), jnp.zeros(N)))
+    internal = np.asarray(eqx.filter_jit(sheet_energy().internal_gradient)(jnp.asarray(x)))
+    stiff = dense(sheet_energy().layout, eqx.filter_jit(sheet_energy().hessian)(jnp.asarray(x), jnp.zeros(N)))
     d = x - sheet().rest
     H = (1 - each)[:, None] * stiff + np.diag(each * K)
     R = np.zeros((3 * N, 3 * N))
@@ -50,8 +50,8 @@ def test_information_equals_the_dense_formula(balance):
         D[3 * i : 3 * i + 3, i] = K * d[i] - internal[i]
     flow = np.zeros(N)
     for term in sheet_energy().terms:
-        for vertices, forces in zip(term.vertices, term.gradient(jnp.asarray(x)[term.vertices]), strict=True):
-            flow[np.asarray(vertices)] += np.linalg.norm(forces, axis=1)
+        forces = np.asarray(eqx.filter_jit(term.gradient)(jnp.asarray(x[np.asarray(term.vertices)])))
+        np.add.at(flow, np.asarray(term.vertices), np.linalg.norm(forces, axis=2))
     tau = np.sqrt(FORCE_SD**2 + (FORCE_SD / LEAST * flow / FORCE_LEVEL) ** 2)
     assert tau.max() > 1.3 * tau.min()
     V = np.diag(((1 - each) * np.repeat(tau, 3)) ** 2 + (each * K * ANCHOR_SD) ** 2)
@@ -74,7 +74,8 @@ def test_the_slope_is_the_derivative_of_the_balance(balance):
     frame = lifts()[3]
     seen, x = evidence(frame, 1), jnp.asarray(frame.x)
     s, step = jnp.asarray(np.random.default_rng(1).uniform(0, 1, N)), 1e-6
-    ahead, behind, here = (balance.linearise(x, s + move, seen) for move in (step, -step, 0.0))
+    linearised = eqx.filter_jit(balance.linearise)
+    ahead, behind, here = (linearised(x, s + move, seen) for move in (step, -step, 0.0))
     difference = (ahead.unbalanced - behind.unbalanced) / (2 * step)
     np.testing.assert_allclose(here.slope, difference, atol=1e-8)
 

@@ -23,7 +23,7 @@ def drawn() -> list[Misfit]:
     """Of frames whose errors are drawn from the model, linear around a lifted state with half of s rigid."""
     balance, truth = sheet_balance(FORCE_SD), lifts()[3]
     seen, s = observed(truth, 0), jnp.asarray(0.5 * attached())
-    frame = balance.linearise(jnp.asarray(truth.x), s, seen)
+    frame = eqx.filter_jit(balance.linearise)(jnp.asarray(truth.x), s, seen)
 
     @eqx.filter_jit
     def misfit(balance: ForceBalance, draw: jax.Array) -> Misfit:
