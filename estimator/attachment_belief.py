@@ -176,6 +176,10 @@ class AttachmentBelief(eqx.Module):
         """One sweep of expectation and belief propagation over all particles at once, damped, given its `gaussian`."""
         return self._matched(*self._cavity(gaussian))
 
+    def swept(self, sweeps: int) -> "AttachmentBelief":
+        """After that many sweeps."""
+        return jax.lax.fori_loop(0, sweeps, lambda _, one: one.sweep(one.gaussian()), self)
+
     def posterior(self) -> "Posterior":
         """What is believed of each particle; call `sweep` before."""
         gaussian = self.gaussian()

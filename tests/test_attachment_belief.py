@@ -18,7 +18,7 @@ STIFFNESS = SpikeAndSlab.build(spike=3e-3, rungs=RUNGS, spread=SPREAD, even=1e12
 """So sure of its shares that nothing is learned."""
 PROBABILITY, REFERENCE = 0.1, 30.0
 
-posterior = eqx.filter_jit(AttachmentBelief.posterior)
+swept, posterior = eqx.filter_jit(AttachmentBelief.swept), eqx.filter_jit(AttachmentBelief.posterior)
 moments = eqx.filter_jit(AttachmentBelief.moments)
 interval = eqx.filter_jit(AttachmentBelief.interval)
 
@@ -28,11 +28,6 @@ def chain(n: int, *, coupling: float) -> AttachmentBelief:
     edges = np.column_stack([np.arange(n - 1), np.arange(1, n)])
     prior = AttachmentPrior.build(n, edges, stiffness=STIFFNESS, probability=PROBABILITY, coupling=coupling)
     return AttachmentBelief.before(prior, reference=REFERENCE)
-
-
-@eqx.filter_jit
-def refined(belief: AttachmentBelief, sweeps: int) -> AttachmentBelief:
-    return jax.lax.fori_loop(0, sweeps, lambda _, one: one.sweep(one.gaussian()), belief)
 
 
 def alone(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +41,7 @@ def alone(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def test_independent_measurements_give_each_particle_its_own_posterior(monkeypatch):
     monkeypatch.setattr(attachment_belief, "MOVED", 0.0)
     mean, variance = np.array([0.0, 0.02, 0.15, 0.9]), np.array([1e-5, 1e-4, 1e-4, 1e-2])
-    belief = refined(chain(4, coupling=0.0).add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)), 30)
+    belief = swept(chain(4, coupling=0.0).add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)), 30)
     expected, spread = alone(mean, variance)
     found = posterior(belief)
     np.testing.assert_allclose(found.mean, expected, rtol=1e-6)
@@ -58,7 +53,7 @@ def test_odds_along_a_chain_are_exact():
     n, coupling = 5, 1.5
     mean, variance = np.array([0.0, 0.01, 0.012, 0.0, 0.05]), np.full(5, 3e-5)
     belief = chain(n, coupling=coupling)
-    belief = refined(belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)), 60)
+    belief = swept(belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)), 60)
     log_odds = jnp.full(n, logit(PROBABILITY))
     factor = np.asarray(STIFFNESS.posterior(jnp.asarray(mean), jnp.asarray(variance), log_odds)[1])
     total, attached = 0.0, np.zeros(n)
@@ -75,7 +70,7 @@ def test_two_particles_that_share_a_load():
     cannot have two peaks; the spread that it states instead is not too small."""
     total, variance, faint = 0.2, 1e-4, 1e-3
     precision = np.full((2, 2), 1 / variance) + faint * np.eye(2)
-    belief = refined(chain(2, coupling=0.0).add(jnp.asarray(precision), jnp.asarray(np.full(2, total / variance))), 60)
+    belief = swept(chain(2, coupling=0.0).add(jnp.asarray(precision), jnp.asarray(np.full(2, total / variance))), 60)
     s = np.concatenate([np.linspace(0, 0.02, 400, endpoint=False), np.linspace(0.02, 1, 2400)])
     parts = [np.exp(-0.5 * ((s - at) / sd) ** 2) for at, sd in ((0, 3e-3), *((rung, SPREAD * rung) for rung in RUNGS))]
     free, soft, stiff = (part / np.trapezoid(part, s) for part in parts)
@@ -92,7 +87,7 @@ def test_two_particles_that_share_a_load():
 
 def test_what_nothing_was_seen_of_stays_at_the_prior():
     belief = chain(3, coupling=0.0)
-    seen = refined(belief.add(jnp.diag(jnp.array([1e6, 0.0, 0.0])), jnp.array([1e5, 0.0, 0.0])), 30)
+    seen = swept(belief.add(jnp.diag(jnp.array([1e6, 0.0, 0.0])), jnp.array([1e5, 0.0, 0.0])), 30)
     assert float(posterior(seen).attached[0]) > 0.99
     np.testing.assert_allclose(posterior(seen).attached[1:], PROBABILITY, rtol=1e-6)
     assert float(belief.entropy()) > float(seen.entropy())
@@ -101,13 +96,13 @@ def test_what_nothing_was_seen_of_stays_at_the_prior():
 def test_an_attached_neighbour_raises_the_odds():
     """One that is certain multiplies them by e^J."""
     coupling = 1.2
-    belief = refined(chain(2, coupling=coupling).add(jnp.diag(jnp.array([1e6, 0.0])), jnp.array([3e5, 0.0])), 60)
+    belief = swept(chain(2, coupling=coupling).add(jnp.diag(jnp.array([1e6, 0.0])), jnp.array([3e5, 0.0])), 60)
     assert float(posterior(belief).attached[1]) == pytest.approx(expit(logit(PROBABILITY) + coupling), rel=1e-6)
 
 
 def test_intervals_open_upwards_where_only_a_lower_end_is_known():
     mean, sd = np.array([0.0, 0.1, 0.99]), np.array([1e-3, 5e-3, 5e-2])
-    belief = refined(chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2)), 30)
+    belief = swept(chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2)), 30)
     lower, upper = (np.asarray(end) for end in interval(belief))
     assert lower[0] == 0 and upper[0] < REFERENCE * 0.01
     assert lower[1] < REFERENCE * 0.1 / 0.9 < upper[1] < np.inf

@@ -26,7 +26,7 @@ def outlook() -> Outlook:
     belief, near = sheet_prior(), np.linalg.norm(sheet().rest, axis=1) < 20e-3
     precision = jnp.diag(jnp.where(near, 5e-3**-2, 0.0))
     belief = belief.add(precision, precision @ jnp.where(attached(), KNOWN, 0.0))
-    swept = eqx.filter_jit(jax.lax.fori_loop)(0, 20, lambda _, one: one.sweep(one.gaussian()), belief)
+    swept = eqx.filter_jit(belief.swept)(20)
     return Outlook.build(sheet_balance(1e-4), swept, SIGHT, ALL)
 
 

@@ -44,7 +44,7 @@ def evidence():
 
 @eqx.filter_jit
 def swept(belief: AttachmentBelief) -> AttachmentBelief:
-    return jax.lax.fori_loop(0, 30, lambda _, one: one.sweep(one.gaussian()), belief)
+    return belief.swept(30)
 
 
 @eqx.filter_jit

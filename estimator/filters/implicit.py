@@ -216,11 +216,7 @@ class _Grasp:
         return grasp
 
 
-@eqx.filter_jit
-def _settled(
-    balance: ForceBalance, start: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
-) -> Float[Array, "n 3"]:
-    return balance.settle(start, s, evidence)
+_settled, _misfit = eqx.filter_jit(ForceBalance.settle), eqx.filter_jit(ForceBalance.misfit)
 
 
 @eqx.filter_jit
@@ -231,11 +227,6 @@ def _seen(
     frame = balance.approach(x, s, evidence)
     fit = balance.fit(frame)
     return frame, fit, balance.information(frame, fit)
-
-
-@eqx.filter_jit
-def _misfit(balance: ForceBalance, frame: Frame, fit: Fit, evidence: Evidence) -> Misfit:
-    return balance.misfit(frame, fit, evidence)
 
 
 @eqx.filter_jit
@@ -254,9 +245,7 @@ def _believed(
 
 @eqx.filter_jit
 def _swept(belief: AttachmentBelief) -> Stated:
-    for _ in range(SWEEPS):
-        belief = belief.sweep(belief.gaussian())
-    return _stated(belief, jnp.asarray(True))
+    return _stated(belief.swept(SWEEPS), jnp.asarray(True))
 
 
 def _sampled(belief: Any, rounds: tuple[int, int]) -> Stated:
