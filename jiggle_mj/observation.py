@@ -161,6 +161,11 @@ class Declaration:
     """Whether the tissue lies on a bed at rest, which it cannot pass; without gravity there is none."""
     mesh: DeclaredMesh | None = None
 
+    @property
+    def hangs(self) -> bool:
+        """Whether it has weight, and no bed under it."""
+        return not self.bed and any(self.gravity)
+
     def __post_init__(self) -> None:
         """Check the ranges."""
         for name in ("membrane_stiffness", "thickness", "areal_density"):

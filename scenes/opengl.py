@@ -7,9 +7,9 @@ it. Whether a context can be made is known only when a renderer is built: see `s
 import os
 import sys
 
-TOO_LATE = "mujoco" in sys.modules and "MUJOCO_GL" not in os.environ
+TOO_LATE = "mujoco" in sys.modules and not os.environ.get("MUJOCO_GL")
 """MuJoCo was imported without a backend before this package was."""
-os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL") or "egl"
 
 BACKEND = os.environ["MUJOCO_GL"]
 """The OpenGL backend that was asked for."""

@@ -82,7 +82,7 @@ def gather(
     mistaken = another_shape(frames, sd, fields)
     return Gathered(
         estimator=estimator,
-        frames=_parted([_weighed(one, sd, fields) for k, one in enumerate(frames) if k not in mistaken]),
+        frames=_parted([_weighed(one, sd, fields) for one in _without(frames, mistaken)]),
         noise=noise,
         fields=fields,
         detection=estimator.detection,
@@ -134,6 +134,18 @@ def _weighed(one: Timed, sd: float, fields: Float[np.ndarray, "n modes"]) -> Tim
     with jax.enable_x64(True):
         precision = jnp.where(one.frame.visible[:, None, None], jnp.eye(3)[None] / sd**2, 0.0)
         return replace(one, frame=replace(one.frame, precision=precision, held_sd=jnp.asarray(np.sqrt(shared))))
+
+
+def _without(frames: list[Timed], mistaken: list[int]) -> list[Timed]:
+    """All but some; what the tool reported with them goes to the frame after, of the same grasp."""
+    kept: list[Timed] = []
+    told: tuple[tuple[float, Float[np.ndarray, " 3"]], ...] = ()
+    for k, one in enumerate(frames):
+        told = (told if k and one.grasp == frames[k - 1].grasp else ()) + one.reports
+        if k not in mistaken:
+            kept.append(replace(one, reports=told))
+            told = ()
+    return kept
 
 
 def _parted(frames: list[Timed]) -> list[Timed]:

@@ -54,6 +54,7 @@ class Problem:
         mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
         energy = undisturbed(mesh, estimator.declaration)
         balance = force_balance(mesh, energy, estimator.declaration, estimator.config).widened(FORCE_VARIANCE)
+        library = tuple(effect for effect in library if estimator.declaration.hangs or not effect.hanging)
         sheet = Sheet(balance=balance, view=centred(mesh.rest), library=library)
         own = {name: sd for name, sd in OWN.items() if any(effect.name == name for effect in library)}
         return cls(

@@ -48,7 +48,7 @@ class Sheet(eqx.Module):
 
     def model(self, theta: Float[Array, " p"], moment: Moment, way: Float[Array, " 3"]) -> SheetModel:
         """Of one frame, with effects of those sizes."""
-        model, start = SheetModel(energy=self.balance.energy, tool=way, view=self.view), 0
+        model, start = SheetModel(energy=self.balance.energy, tool=way, view=self.view, time=moment.time), 0
         for effect in self.library:
             model = effect.acts(model, theta[start : start + effect.size], moment)
             start += effect.size

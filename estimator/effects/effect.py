@@ -37,6 +37,8 @@ class Effect:
     """Whether parameters below 0 make no sense."""
     lingers: bool = False
     """Whether it depends on where the sheet is in the frame itself by `Moment.past`: predicted until that stays."""
+    hanging: bool = False
+    """Whether only a sheet with weight and no bed under it may have it."""
     sensing: bool = False
     """Whether it is of the tool, the camera or the tracker, so that it holds for one session alone."""
 

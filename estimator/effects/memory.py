@@ -105,7 +105,7 @@ MEMORY = (
         prior_sd=(1.0, 5.0),
         natural=((1.0, 2.0),),
         source="the sheet's own mass; a cloth in air swings for a second",
-        confounded_with=("viscous_drag", "image_latency"),
+        confounded_with=("viscous_drag", "image_latency", "swing"),
         non_negative=True,
     ),
     Effect(

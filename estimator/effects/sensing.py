@@ -80,7 +80,8 @@ def _at_another_time(model: SheetModel, moment: Moment, later: Float[Array, ""])
         return jnp.stack([jnp.interp(time, moment.report_times, moment.reports[:, k]) for k in range(3)])
 
     further = at(moment.time + later) - at(moment.time)
-    return _taken(model, model.tool + jnp.where(moment.closed > 0, further, 0.0))
+    then = eqx.tree_at(lambda one: one.time, model, model.time + later)
+    return _taken(then, then.tool + jnp.where(moment.closed > 0, further, 0.0))
 
 
 def _taken(model: SheetModel, way: Float[Array, " 3"]) -> SheetModel:

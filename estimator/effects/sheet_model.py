@@ -56,6 +56,8 @@ class SheetModel(eqx.Module):
     tool: Float[Array, " 3"]
     """How far the jaws have taken what they hold since they closed [m]."""
     view: View
+    time: Float[Array, ""]
+    """By the clock of the tool's reports, when what is seen was so [s]."""
 
     def has(self, kind: type[Term]) -> bool:
         """Whether the energy has a term of a kind: a sheet in the air has no bed."""

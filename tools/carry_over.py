@@ -1,0 +1,61 @@
+"""What a loop found of one recording, held against another of the same sheet: does it foretell that one better?
+
+    python tools/carry_over.py out/cloth/discrepancy.json other.mcap
+
+Nothing is fitted to the other recording, and nothing is attached in it. Effects that hold for one session alone (of the
+tool, the camera or the tracker) are also left out one by one.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jiggle_mj.estimator.attribution.gather import gather
+from jiggle_mj.estimator.attribution.held_out import from_rest
+from jiggle_mj.estimator.attribution.problem import Point, Problem
+from jiggle_mj.estimator.effects import LIBRARY
+
+from jiggle_mj.recording import Recording
+
+
+def main() -> None:
+    """Print the root mean square error [mm] of each grasp and of all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("discrepancy", type=Path)
+    parser.add_argument("recording", type=Path)
+    said = parser.parse_args()
+    effects = json.loads(said.discrepancy.read_text())["effects"]
+    recording = Recording.open(said.recording)
+    gathered = gather(recording.declaration, recording.camera, recording)
+    with jax.enable_x64(True):
+        problem = Problem.build(gathered, LIBRARY)
+        variants = {"nothing": [], "all of it": effects}
+        for one in effects:
+            if one["this_session_alone"]:
+                variants[f"all but {one['name']}"] = [other for other in effects if other is not one]
+        for name, some in variants.items():
+            print(f"{name}: {_missed(problem, some)}", flush=True)
+
+
+def _missed(problem: Problem, effects: list[dict[str, Any]]) -> str:
+    frames = problem.history.frames
+    theta = np.zeros(problem.sheet.size)
+    for one in effects:
+        theta[problem.sheet.place(one["name"], one["site"])] = one["theta"]
+    states = np.stack([one.state for one in frames])
+    plain = Point(theta=theta, s=np.zeros(states.shape[1]), states=states, seen=states)
+    seen = from_rest(problem, plain, list(range(len(frames))), by_tool=True).seen
+    squares: dict[int, list[np.ndarray]] = {}
+    for k, one in enumerate(frames):
+        counted = np.asarray(one.frame.visible & ~one.frame.held)
+        squares.setdefault(one.grasp, []).append(np.sum((np.asarray(one.frame.y) - seen[k])[counted] ** 2, axis=1))
+    each = {grasp: 1e3 * float(np.sqrt(np.mean(np.concatenate(some)))) for grasp, some in squares.items()}
+    whole = 1e3 * float(np.sqrt(np.mean(np.concatenate([one for some in squares.values() for one in some]))))
+    return f"{whole:.1f} mm; by grasp " + ", ".join(f"{one:.1f}" for one in each.values())
+
+
+if __name__ == "__main__":
+    main()
