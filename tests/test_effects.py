@@ -47,12 +47,12 @@ def moment():
 
 
 @pytest.fixture(scope="module")
-def plain():
+def plain(moment):
     return SheetModel(
         energy=undisturbed(sheet(), DECLARATION),
         tool=jnp.asarray(2 * WAY),
         view=centred(sheet().rest),
-        time=jnp.asarray(1.25),
+        time=moment.time,
     )
 
 

@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 from small_sheet import DECLARATION, equilateral
 
 SWING, LATE = (next(one for one in LIBRARY if one.name == name) for name in ("swing", "image_latency"))
-G = 9.81
+G = -DECLARATION.gravity[2]
 REPORTS = np.array([0.0, 0.05, 0.11, 0.11, 0.2, 0.24, 0.4, 0.5])
 WAYS = np.random.default_rng(3).normal(scale=0.01, size=(8, 3))
 WAYS[3] = WAYS[2]  # as when the tool is told at a report's own time

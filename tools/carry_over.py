@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 from jiggle_mj.estimator.attribution.gather import gather
-from jiggle_mj.estimator.attribution.held_out import from_rest
+from jiggle_mj.estimator.attribution.held_out import from_rest, off, rms
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects import LIBRARY
 
@@ -47,14 +47,10 @@ def _missed(problem: Problem, effects: list[dict[str, Any]]) -> str:
         theta[problem.sheet.place(one["name"], one["site"])] = one["theta"]
     states = np.stack([one.state for one in frames])
     plain = Point(theta=theta, s=np.zeros(states.shape[1]), states=states, seen=states)
-    seen = from_rest(problem, plain, list(range(len(frames))), by_tool=True).seen
-    squares: dict[int, list[np.ndarray]] = {}
-    for k, one in enumerate(frames):
-        counted = np.asarray(one.frame.visible & ~one.frame.held)
-        squares.setdefault(one.grasp, []).append(np.sum((np.asarray(one.frame.y) - seen[k])[counted] ** 2, axis=1))
-    each = {grasp: 1e3 * float(np.sqrt(np.mean(np.concatenate(some)))) for grasp, some in squares.items()}
-    whole = 1e3 * float(np.sqrt(np.mean(np.concatenate([one for some in squares.values() for one in some]))))
-    return f"{whole:.1f} mm; by grasp " + ", ".join(f"{one:.1f}" for one in each.values())
+    foretold = from_rest(problem, plain, list(range(len(frames))), by_tool=True)
+    grasps = problem.history.by(lambda one: one.grasp, range(len(frames))).values()
+    each = [off(problem, foretold, grasp) for grasp in grasps]
+    return f"{1e3 * rms(np.concatenate(each)):.1f} mm; by grasp " + ", ".join(f"{1e3 * rms(one):.1f}" for one in each)
 
 
 if __name__ == "__main__":

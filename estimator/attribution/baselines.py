@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, Timed
+from jiggle_mj.estimator.attribution.held_out import rms
 
 
 def unmoved(frames: list[Timed], part: int) -> float:
@@ -42,12 +43,11 @@ def _since_closed(frames: list[Timed]) -> list[_SinceClosed]:
     found = []
     for one in frames:
         then, now = first.setdefault(one.grasp, one.frame), one.frame
-        counted = np.asarray(now.visible & ~now.held & then.visible)
+        counted = np.asarray(now.counted & then.visible)
         gone = np.asarray(now.y) - np.asarray(then.y)
         found.append(_SinceClosed(part=one.part, way=np.asarray(now.way), gone=gone, counted=counted))
     return found
 
 
 def _rms(frames: list[_SinceClosed]) -> float:
-    every = np.concatenate([one.gone[one.counted] for one in frames])
-    return float(np.sqrt(np.mean(np.sum(every**2, axis=1))))
+    return rms(np.concatenate([one.gone[one.counted] for one in frames]))

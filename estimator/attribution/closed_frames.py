@@ -34,6 +34,11 @@ class ClosedFrame(eqx.Module):
     held_sd: Float[Array, ""]
     """Of the mean of what is held, by the noise of what is seen [m]."""
 
+    @property
+    def counted(self) -> Bool[Array, " n"]:
+        """Particles that are seen and not held."""
+        return self.visible & ~self.held
+
 
 @dataclass(frozen=True, kw_only=True)
 class Timed:

@@ -39,7 +39,7 @@ class Foretold:
     @property
     def rms(self) -> float:
         """Root mean square distance [m]."""
-        return float(np.sqrt(np.mean(np.sum(self.off**2, axis=1))))
+        return rms(self.off)
 
     @property
     def excess(self) -> float:
@@ -68,7 +68,6 @@ def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
     """One part that was not fitted to."""
     frames = problem.frames({part})
     anew, closed = from_rest(problem, fitted.point, frames, by_tool=True), problem.history.frames
-    counted = {k: np.asarray(closed[k].frame.visible & ~closed[k].frame.held) for k in frames}
 
     def sd() -> Float[np.ndarray, "m 3"]:
         weights, known = weighed(problem, anew, frames), _covariance(problem, fitted)
@@ -76,10 +75,21 @@ def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
         def one(k: int) -> Float[np.ndarray, "n 3"]:
             return _sd(problem, weights[k], closed[k].frame, known, jnp.asarray(anew.states[k]))
 
-        return np.concatenate([found[counted[k]] for k, found in side_by_side(one, frames).items()])
+        every = side_by_side(one, frames)
+        return np.concatenate([every[k][np.asarray(closed[k].frame.counted)] for k in frames])
 
-    off = np.concatenate([(np.asarray(closed[k].frame.y) - anew.seen[k])[counted[k]] for k in frames])
-    return Foretold(off=off, reckon=sd)
+    return Foretold(off=off(problem, anew, frames), reckon=sd)
+
+
+def off(problem: Problem, point: Point, frames: list[int]) -> Float[np.ndarray, "m 3"]:
+    """Seen less predicted of some frames, of the particles that are counted [m]."""
+    closed = [(problem.history.frames[k].frame, point.seen[k]) for k in frames]
+    return np.concatenate([(np.asarray(frame.y) - seen)[np.asarray(frame.counted)] for frame, seen in closed])
+
+
+def rms(off: Float[np.ndarray, "m 3"]) -> float:
+    """Root mean square distance [m]."""
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
 def from_rest(problem: Problem, point: Point, frames: list[int], *, by_tool: bool) -> Point:

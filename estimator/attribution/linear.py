@@ -182,7 +182,7 @@ def _metric(
     metric = Metric(
         balance=balance,
         frame=linear,
-        seen=(frame.visible & ~frame.held).astype(float),
+        seen=frame.counted.astype(float),
         noise=white,
         spread=jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white)),
         fields=fields,
@@ -227,7 +227,7 @@ def _each(of: Callable[[Array], Array], columns: Float[Array, "n 3 k"]) -> Float
 
 def _as_seen(frame: ClosedFrame, off: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
     """What is off where positions are seen: of each particle that counts, and together of those that are held."""
-    counted = frame.visible & ~frame.held
+    counted = frame.counted
     held = jnp.where(frame.held[:, None, None], mean_of_held(frame, off)[None], 0.0)
     return jnp.where(counted[:, None, None], off, held)
 

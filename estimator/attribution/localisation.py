@@ -21,7 +21,7 @@ def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
     off = np.full((len(frames), len(rest), 3), np.nan)
     for row, k in zip(off, frames, strict=True):
         frame = problem.history.frames[k].frame
-        counted = np.asarray(frame.visible & ~frame.held)
+        counted = np.asarray(frame.counted)
         row[counted] = (np.asarray(frame.y) - fitted.point.seen[k])[counted]
     seen = np.asarray(np.isfinite(off).all(axis=2))
     ever = np.asarray(seen.any(axis=0))

@@ -46,9 +46,13 @@ class Sheet(eqx.Module):
             start += effect.size
         raise ValueError(f"there is no effect {name!r}; there are {[one.name for one in self.library]}.")
 
+    def plain(self, moment: Moment, way: Float[Array, " 3"]) -> SheetModel:
+        """Of one frame, without any."""
+        return SheetModel(energy=self.balance.energy, tool=way, view=self.view, time=moment.time)
+
     def model(self, theta: Float[Array, " p"], moment: Moment, way: Float[Array, " 3"]) -> SheetModel:
         """Of one frame, with effects of those sizes."""
-        model, start = SheetModel(energy=self.balance.energy, tool=way, view=self.view, time=moment.time), 0
+        model, start = self.plain(moment, way), 0
         for effect in self.library:
             model = effect.acts(model, theta[start : start + effect.size], moment)
             start += effect.size

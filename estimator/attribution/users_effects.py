@@ -23,7 +23,7 @@ def check_effects(problem: Problem) -> None:
     states = np.stack([one.state for one in problem.history.frames])
     last = len(states) - 1
     moment, frame = problem.history.moment(last, states), problem.history.frames[last].frame
-    plain = SheetModel(energy=problem.sheet.balance.energy, tool=frame.way, view=problem.sheet.view, time=moment.time)
+    plain = problem.sheet.plain(moment, frame.way)
     for effect in problem.sheet.library:
         if effect not in LIBRARY:
             _check(effect, plain, moment, jnp.asarray(states[last]))

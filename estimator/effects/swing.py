@@ -2,7 +2,7 @@
 
 Its lowest mode, moved by the grip alone: of a chain that hangs by one end and is l long, and of a sheet alike,
 
-    w^2 = (j / 2)^2 g / l    j = 2.4048, the first zero of the Bessel function J0 [Lamb, Higher Mechanics, 1920]
+    w^2 = (j / 2)^2 g / l    j = 2.4048, the first zero of the Bessel function J0 [D. Bernoulli 1732]
 
 With the grip's acceleration a across gravity, the share e of its mass that shows, and the damping rate c, it is off by
 
