@@ -75,7 +75,7 @@ class TriangleMembrane(Term):
         """A F S grad N [N]."""
         F = self._deformation(x)
         stress, _, _ = self._stress(F)
-        return self.area[:, None, None] * jnp.einsum("fik,fkl,fal->fai", F, _matrix(stress), self.shape_gradient)
+        return self.area[:, None, None] * jnp.einsum("fik,fkl,fal->fai", F, stress_matrix(stress), self.shape_gradient)
 
     def hessian(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3 3 3"]:
         """Material and geometric part [N/m]."""
@@ -103,7 +103,7 @@ class TriangleMembrane(Term):
         shear = jnp.einsum("fi,fa->fai", F[:, :, 0], N[:, :, 1]) + jnp.einsum("fi,fa->fai", F[:, :, 1], N[:, :, 0])
         variation = jnp.stack([*(jnp.einsum("fi,fa->fai", F[:, :, k], N[:, :, k]) for k in (0, 1)), shear], axis=-1)
         material = jnp.einsum("faip,fpq,fbjq->faibj", variation, tangent, variation)
-        stress = _matrix(stress) if compressive else _tensile(_matrix(stress))
+        stress = stress_matrix(stress) if compressive else tensile(stress_matrix(stress))
         geometric = jnp.einsum("fak,fkl,fbl,ij->faibj", N, stress, N, jnp.eye(3, dtype=F.dtype))
         return self.area[:, None, None, None, None] * (material + geometric)
 
@@ -170,11 +170,12 @@ def _green(F: Float[Array, "f 3 2"]) -> Float[Array, "f 3"]:
     return jnp.stack([0.5 * (metric[:, 0, 0] - 1), 0.5 * (metric[:, 1, 1] - 1), metric[:, 0, 1]], axis=1)
 
 
-def _matrix(stress: Float[Array, "f 3"]) -> Float[Array, "f 2 2"]:
+def stress_matrix(stress: Float[Array, "f 3"]) -> Float[Array, "f 2 2"]:
+    """From (S_11, S_22, S_12)."""
     return stress[:, jnp.array([[0, 2], [2, 1]])]
 
 
-def _tensile(stress: Float[Array, "f 2 2"]) -> Float[Array, "f 2 2"]:
+def tensile(stress: Float[Array, "f 2 2"]) -> Float[Array, "f 2 2"]:
     """Symmetric 2x2 matrices with negative eigenvalues set to zero, in closed form."""
     mean = 0.5 * (stress[:, 0, 0] + stress[:, 1, 1])
     deviator = stress - mean[:, None, None] * jnp.eye(2, dtype=stress.dtype)[None]

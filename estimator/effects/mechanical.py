@@ -9,6 +9,7 @@ from jiggle_mj.estimator.effects.effect import Effect
 from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, across, extent
 from jiggle_mj.estimator.effects.terms import Film, Load
 from jiggle_mj.estimator.environment import Bed, Weight
+from jiggle_mj.estimator.hanging import Tension
 from jiggle_mj.estimator.membrane import TriangleMembrane, plane_stress
 
 STANDARD_GRAVITY = 9.80665
@@ -42,7 +43,12 @@ def cosines(place: Float[Array, "m 2"], waves: int) -> Float[Array, "m modes"]:
 
 def _gravity(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
     weight = model.term(Weight)
-    return model.with_term(eqx.tree_at(lambda t: t.gravity, weight, weight.gravity + STANDARD_GRAVITY * theta))
+    gravity = weight.gravity + STANDARD_GRAVITY * theta
+    changed = model.with_term(eqx.tree_at(lambda t: t.gravity, weight, gravity))
+    if not model.has(Tension):
+        return changed
+    tension, share = model.term(Tension), gravity @ weight.gravity / jnp.sum(weight.gravity**2)
+    return changed.with_term(eqx.tree_at(lambda t: t.stress, tension, share * tension.stress))
 
 
 def _bed(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
