@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
 from jiggle_mj.estimator.energy import Term
 from jiggle_mj.estimator.environment import Weight
-from jiggle_mj.estimator.membrane import TriangleMembrane, stress_matrix, tensile
+from jiggle_mj.estimator.membrane import TriangleMembrane, green, stress_matrix, tensile
 from jiggle_mj.estimator.mesh import SheetMesh
 from scipy.sparse.linalg import spsolve
 
@@ -56,8 +56,7 @@ class Tension(Term):
     def energy(self, x: Float[Array, "f 3 3"]) -> Float[Array, " f"]:
         """[J]."""
         F = jnp.einsum("fai,fak->fik", x, self.shape_gradient)
-        metric = jnp.einsum("fik,fil->fkl", F, F) - jnp.eye(2, dtype=F.dtype)
-        return 0.5 * self.area * jnp.einsum("fkl,fkl->f", stress_matrix(self.stress), metric)
+        return self.area * jnp.sum(self.stress * green(F), axis=1)
 
     def gradient(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3"]:
         """[N]."""

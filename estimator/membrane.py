@@ -63,7 +63,7 @@ class TriangleMembrane(Term):
 
     def strain(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3"]:
         """Green's, whether elastic or not: (E_11, E_22, 2 E_12)."""
-        return _green(self._deformation(x))
+        return green(self._deformation(x))
 
     def energy(self, x: Float[Array, "f 3 3"]) -> Float[Array, " f"]:
         """[J]."""
@@ -90,7 +90,7 @@ class TriangleMembrane(Term):
 
     def _stress(self, F: Float[Array, "f 3 2"]) -> tuple[Float[Array, "f 3"], Float[Array, "f 3"], Float[Array, " f"]]:
         """S = (1 + a w) C E, C E, and 1 + a w [N/m]."""
-        strain = _green(F) - self.inelastic
+        strain = green(F) - self.inelastic
         linear = jnp.einsum("fpq,fq->fp", self.elasticity, strain)
         stiffer = 1 + self.stiffening * jnp.sum(strain * linear, axis=1) / self.stiffness
         return stiffer[:, None] * linear, linear, stiffer
@@ -165,7 +165,8 @@ def material_axis(normal: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
     return np.eye(3)[0 if abs(normal[0]) <= max(abs(normal[1]), abs(normal[2])) else 1]
 
 
-def _green(F: Float[Array, "f 3 2"]) -> Float[Array, "f 3"]:
+def green(F: Float[Array, "f 3 2"]) -> Float[Array, "f 3"]:
+    """Green's strain (E_11, E_22, 2 E_12) of a deformation gradient."""
     metric = jnp.einsum("fik,fil->fkl", F, F)
     return jnp.stack([0.5 * (metric[:, 0, 0] - 1), 0.5 * (metric[:, 1, 1] - 1), metric[:, 0, 1]], axis=1)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jiggle_mj.estimator.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.block_tridiagonal import BlockTridiagonal, Layout
+from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, centred, undisturbed
 from jiggle_mj.estimator.energy import SheetEnergy
 from jiggle_mj.estimator.environment import Grip
 from jiggle_mj.estimator.equilibrium import equilibrium
@@ -27,6 +28,8 @@ DECLARATION = Declaration()
 STIFFNESS = 3.0
 """Of each attached particle [N/m], a tenth of the membrane's."""
 GRIP_RADIUS = 8e-3
+STOOD = (np.zeros(1), np.zeros((1, 3)))
+"""When the tool reported [s], and how far it had gone [m]."""
 FORCE_TOLERANCE = 1e-8
 """[N]; the weight of one particle is 4e-4."""
 
@@ -103,6 +106,37 @@ def sheet_balance(force_sd: float, force_level: float = np.inf) -> ForceBalance:
 def sheet_prior() -> AttachmentBelief:
     """The implicit filter's."""
     return prior_belief(sheet(), reference=DECLARATION.membrane_stiffness)
+
+
+def at_rest(
+    mesh: SheetMesh,
+    declared: Declaration,
+    *,
+    at: float = 0.0,
+    times: np.ndarray = STOOD[0],
+    ways: np.ndarray = STOOD[1],
+) -> tuple[SheetModel, Moment]:
+    """A sheet's model without effects, and a moment when it lies as ever, whatever the tool says."""
+    x = jnp.asarray(mesh.rest)
+    model = SheetModel(
+        energy=undisturbed(mesh, declared), tool=jnp.zeros(3), view=centred(mesh.rest), time=jnp.asarray(at)
+    )
+    moment = Moment(
+        rest=x,
+        time=jnp.asarray(at),
+        gap=jnp.asarray(0.1),
+        earlier_gap=jnp.asarray(0.1),
+        closed=jnp.asarray(at),
+        now=x,
+        before=x,
+        earlier=x,
+        report_times=jnp.asarray(times),
+        reports=jnp.asarray(ways),
+        past=x[None],
+        began=jnp.zeros(1),
+        ended=jnp.zeros(1),
+    )
+    return model, moment
 
 
 def gripped(energy: SheetEnergy, x: np.ndarray, corner: np.ndarray, tip: np.ndarray) -> SheetEnergy:

@@ -10,6 +10,7 @@ import pytest
 from jiggle_mj.estimator.bending import IsometricBending
 from jiggle_mj.estimator.energy import Term
 from jiggle_mj.estimator.environment import Bed, Grip, Tether, Weight
+from jiggle_mj.estimator.hanging import Tension
 from jiggle_mj.estimator.membrane import EdgeMembrane, TriangleMembrane
 from jiggle_mj.estimator.surrogate import surrogate
 from scipy.spatial.transform import Rotation
@@ -44,6 +45,8 @@ def terms() -> dict[str, Term]:
         inelastic=jnp.asarray(generator.normal(size=(len(MESH.faces), 3)) * 0.005),
         stiffening=jnp.asarray(5.0),
     )
+    stress = jnp.asarray(generator.normal(size=(len(MESH.faces), 3)))
+    tension = Tension(vertices=plain.vertices, shape_gradient=plain.shape_gradient, area=plain.area, stress=stress)
     return {
         "triangles": TriangleMembrane.build(MESH, stiffness=K, poisson=NU),
         "fibres that stiffen and are stretched at rest": tissue,
@@ -54,6 +57,7 @@ def terms() -> dict[str, Term]:
         "bed": Bed.build(MESH.rest, load=np.full(MESH.n, 2e-3), up=np.array([0.0, 0.0, 1.0]), stiffness=10.0),
         "grip": Grip.build(jnp.asarray(MESH.rest), jnp.asarray(TIP), radius=8e-3, stiffness=100.0),
         "tether": tether,
+        "tension": tension,
     }
 
 

@@ -6,19 +6,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hanging_sheet import REPORT, SHEET, HangingSheet, recording, smooth
+from jiggle_mj.estimator.attribution.closing import close_the_loop
+from jiggle_mj.estimator.attribution.discrepancy import discrepancy
+from jiggle_mj.estimator.attribution.gather import gather
+from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, centred, undisturbed
+from jiggle_mj.estimator.effects.sheet_model import undisturbed
 from jiggle_mj.estimator.effects.swing import BESSEL
 from jiggle_mj.estimator.effects.terms import Load
 from jiggle_mj.estimator.environment import Weight
 from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.surrogate import surrogate
+from jiggle_mj.eval.discrepancy_page import story
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
-from small_sheet import DECLARATION, equilateral
+from small_sheet import DECLARATION, at_rest, equilateral
 
 SWING, LATE = (next(one for one in LIBRARY if one.name == name) for name in ("swing", "image_latency"))
 G = -DECLARATION.gravity[2]
+AIR = dataclasses.replace(DECLARATION, bed=False)
 REPORTS = np.array([0.0, 0.05, 0.11, 0.11, 0.2, 0.24, 0.4, 0.5])
 WAYS = np.random.default_rng(3).normal(scale=0.01, size=(8, 3))
 WAYS[3] = WAYS[2]  # as when the tool is told at a report's own time
@@ -34,28 +40,7 @@ def hung():
 def pull(hung: SheetMesh, at: float, theta: list[float], late: float = 0.0) -> np.ndarray:
     """Force by mass [m/s^2]."""
     with jax.enable_x64(True):
-        rest = jnp.asarray(hung.rest)
-        model = SheetModel(
-            energy=undisturbed(hung, dataclasses.replace(DECLARATION, bed=False)),
-            tool=jnp.zeros(3),
-            view=centred(hung.rest),
-            time=jnp.asarray(at),
-        )
-        moment = Moment(
-            rest=rest,
-            time=jnp.asarray(at),
-            gap=jnp.asarray(0.1),
-            earlier_gap=jnp.asarray(0.1),
-            closed=jnp.asarray(at),
-            now=rest,
-            before=rest,
-            earlier=rest,
-            report_times=jnp.asarray(REPORTS),
-            reports=jnp.asarray(WAYS),
-            past=rest[None],
-            began=jnp.zeros(1),
-            ended=jnp.zeros(1),
-        )
+        model, moment = at_rest(hung, AIR, at=at, times=REPORTS, ways=WAYS)
         then = LATE.acts(model, jnp.asarray([late]), moment)
         force = SWING.acts(then, jnp.asarray(theta), moment).term(Load).force
         per_mass = np.asarray(force / model.term(Weight).mass[:, None])
@@ -99,7 +84,7 @@ def test_what_has_no_mass_to_show_does_not_swing(hung):
 
 def test_its_period_is_that_of_the_lowest_mode_of_a_sheet_that_hangs(hung):
     """By the eigenvalues of the sheet's own stiffness and mass, about where its weight takes it."""
-    limp = dataclasses.replace(DECLARATION, bed=False, membrane_stiffness=300.0, thickness=1e-4, poisson=0.0)
+    limp = dataclasses.replace(AIR, membrane_stiffness=300.0, thickness=1e-4, poisson=0.0)
     with jax.enable_x64(True):
         energy = undisturbed(hung, limp)
         mass = next(np.repeat(np.asarray(term.mass), 3) for term in energy.terms if isinstance(term, Weight))
@@ -116,11 +101,25 @@ def test_its_period_is_that_of_the_lowest_mode_of_a_sheet_that_hangs(hung):
     np.testing.assert_allclose(lowest, square, rtol=0.05)
 
 
-def test_a_sheet_that_hangs_leaning_is_pulled_within_its_plane_and_one_that_is_held_up_is_not():
-    flat = equilateral(4, 5)
-    for lean, taken in ((np.radians(5), True), (np.radians(-8), True), (np.radians(30), False)):
-        turned = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
-        mesh = SheetMesh(flat.rest[:, [0, 2, 1]] @ turned.T, flat.faces)
-        terms = surrogate(mesh, dataclasses.replace(DECLARATION, bed=False)).terms
-        pulled = next(np.asarray(term.gravity) for term in terms if isinstance(term, Weight))
-        np.testing.assert_allclose(pulled, turned @ [0, 0, -G] if taken else [0, 0, -G], atol=1e-12)
+def test_it_swings_by_that_period_in_the_reference_too():
+    """By the zeros of the free edge's way, once it has been swung."""
+    sheet = HangingSheet()
+    positions, tips = sheet.swung(lambda t: np.array([0.0, 0.0, 0.02 * smooth(t / 0.2)]), 2.5)
+    low, length = positions[0, :, 1].argmin(), np.ptp(positions[0, :, 1])
+    way = (positions[:, low, 2] - tips[:, 2])[round(0.4 / REPORT) :]
+    k = np.flatnonzero(np.diff(np.sign(way)))
+    zeros = k + way[k] / (way[k] - way[k + 1])
+    period = 2 * np.diff(zeros).mean() * REPORT
+    assert len(zeros) > 5
+    np.testing.assert_allclose(period, 2 * np.pi / np.sqrt((BESSEL / 2) ** 2 * G / length), rtol=0.03)
+
+
+@pytest.mark.slow
+def test_what_swings_in_the_reference_is_named_by_its_own_mass_and_foretold():
+    gathered = gather(SHEET, None, recording(4, seed=0))
+    with jax.enable_x64(True), one_thread():
+        found = discrepancy(close_the_loop(gathered), gathered)
+    assert [one["name"] for one in found["effects"]] == ["swing"], story(found)
+    assert found["verdict"] == "effect"
+    assert found["effects"][0]["theta"][0] == pytest.approx(1.0, abs=0.05)
+    assert found["held_out"]["after_rms_m"] < 0.4 * found["held_out"]["before_rms_m"]
