@@ -115,11 +115,14 @@ def test_it_swings_by_that_period_in_the_reference_too():
 
 
 @pytest.mark.slow
-def test_what_swings_in_the_reference_is_named_by_its_own_mass_and_foretold():
+def test_what_swings_in_the_reference_is_named_first_by_its_own_mass_and_foretold():
+    """Beside it `material_damping` may be named: what swings there has more than one mode, and is damped."""
     gathered = gather(SHEET, None, recording(4, seed=0))
     with jax.enable_x64(True), one_thread():
         found = discrepancy(close_the_loop(gathered), gathered)
-    assert [one["name"] for one in found["effects"]] == ["swing"], story(found)
+    names = [one["name"] for one in found["effects"]]
+    assert names[0] == "swing", story(found)
+    assert {*names} <= {"swing", "material_damping"}, story(found)
     assert found["verdict"] == "effect"
     assert found["effects"][0]["theta"][0] == pytest.approx(1.0, abs=0.05)
     assert found["held_out"]["after_rms_m"] < 0.4 * found["held_out"]["before_rms_m"]
