@@ -9,6 +9,7 @@ import tempfile
 
 os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL") or "egl"
 os.environ["JAX_PLATFORMS"] = "cpu"
+os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
 if "PYTEST_XDIST_WORKER" not in os.environ:
     compiled = tempfile.TemporaryDirectory()
     os.environ["JAX_COMPILATION_CACHE_DIR"] = compiled.name
