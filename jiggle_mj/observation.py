@@ -157,7 +157,7 @@ class Declaration:
     """Mass per area [kg/m^2]."""
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """[m/s^2], world; zeros where nobody knows which way is down. A sheet that `hangs` in a plane near it hangs by it:
-    then only its size counts."""
+    then only its size counts, and it was first seen stretched by its weight, held by its topmost particles."""
     bed: bool = True
     """Whether the tissue lies on a bed at rest, which it cannot pass; without gravity there is none."""
     mesh: DeclaredMesh | None = None
