@@ -8,10 +8,9 @@ whatever its stiffness.
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Int
-from jiggle_mj.estimator.energy import Term
+from jaxtyping import Array, Float
 from jiggle_mj.estimator.environment import Weight
-from jiggle_mj.estimator.membrane import TriangleMembrane, green, stress_matrix, tensile
+from jiggle_mj.estimator.membrane import TriangleMembrane, Triangles
 from jiggle_mj.estimator.mesh import SheetMesh
 from scipy.sparse.linalg import spsolve
 
@@ -21,20 +20,16 @@ LOOSE = 1e-9
 """Share of the stiffest particle's that keeps the others from turning about the topmost."""
 
 
-class Tension(Term):
+class Tension(Triangles):
     """Triangles under a second Piola-Kirchhoff stress S that does not depend on their strain: A S . E(x)."""
 
-    vertices: Int[np.ndarray, "f 3"] | Int[Array, "f 3"]
-    shape_gradient: Float[Array, "f 3 2"]
-    """As the membrane's [1/m]."""
-    area: Float[Array, " f"]
-    """[m^2]."""
     stress: Float[Array, "f 3"]
     """S_11, S_22, S_12 [N/m]."""
 
     @classmethod
-    def build(cls, mesh: SheetMesh, membrane: TriangleMembrane, weight: Weight) -> "Tension":
+    def build(cls, mesh: SheetMesh, weight: Weight, *, poisson: float) -> "Tension":
         """What an elastic sheet in its plane has when its topmost particles alone hold it."""
+        membrane = TriangleMembrane.build(mesh, stiffness=1.0, poisson=poisson)
         down = np.asarray(weight.gravity) / np.linalg.norm(weight.gravity)
         height = -mesh.rest @ down
         top = height > height.max() - mesh.spacing / 2
@@ -55,26 +50,19 @@ class Tension(Term):
 
     def energy(self, x: Float[Array, "f 3 3"]) -> Float[Array, " f"]:
         """[J]."""
-        F = jnp.einsum("fai,fak->fik", x, self.shape_gradient)
-        return self.area * jnp.sum(self.stress * green(F), axis=1)
+        return self.area * jnp.sum(self.stress * self.strain(x), axis=1)
 
     def gradient(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3"]:
         """[N]."""
-        return jnp.einsum("fab,fbi->fai", self._springs(stress_matrix(self.stress)), x)
+        return self.force(self.deformation(x), self.stress)
 
     def hessian(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3 3 3"]:
         """The same wherever the sheet is [N/m]."""
-        return jnp.einsum("fab,ij->faibj", self._springs(stress_matrix(self.stress)), jnp.eye(3, dtype=x.dtype))
+        return self.area[:, None, None, None, None] * self.geometric(self.stress, compressive=True)
 
     def positive_hessian(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3 3 3"]:
         """The same without what is compressed."""
-        springs = self._springs(tensile(stress_matrix(self.stress)))
-        return jnp.einsum("fab,ij->faibj", springs, jnp.eye(3, dtype=x.dtype))
-
-    def _springs(self, stress: Float[Array, "f 2 2"]) -> Float[Array, "f 3 3"]:
-        """A grad N S grad N [N/m]."""
-        N = self.shape_gradient
-        return self.area[:, None, None] * jnp.einsum("fak,fkl,fbl->fab", N, stress, N)
+        return self.area[:, None, None, None, None] * self.geometric(self.stress, compressive=False)
 
 
 def as_it_hangs(mesh: SheetMesh, gravity: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"] | None:
@@ -96,10 +84,8 @@ def _normal(mesh: SheetMesh) -> Float[np.ndarray, " 3"]:
 
 def _strain_matrix(mesh: SheetMesh, membrane: TriangleMembrane, plane: Float[np.ndarray, "3 2"]) -> sp.csr_array:
     """From small displacements along the plane's two axes to (E_11, E_22, 2 E_12) of each triangle [1/m]."""
-    N = np.asarray(membrane.shape_gradient, dtype=float)
-    F = np.einsum("fai,fak,ij->fjk", mesh.rest[mesh.faces], N, plane)
-    shear = np.einsum("fi,fa->fai", F[:, :, 0], N[:, :, 1]) + np.einsum("fi,fa->fai", F[:, :, 1], N[:, :, 0])
-    rows = np.stack([*(np.einsum("fi,fa->fai", F[:, :, k], N[:, :, k]) for k in (0, 1)), shear], axis=1)
+    gradient = membrane.strain_gradient(membrane.deformation(jnp.asarray(mesh.rest[mesh.faces])))
+    rows = np.einsum("faip,ij->fpaj", np.asarray(gradient, dtype=float), plane)
     column = np.broadcast_to((2 * mesh.faces[:, :, None] + np.arange(2))[:, None], rows.shape)
-    row = np.broadcast_to(np.arange(3 * len(N)).reshape(-1, 3, 1, 1), rows.shape)
-    return sp.csr_array((rows.ravel(), (row.ravel(), column.ravel())), shape=(3 * len(N), 2 * mesh.n))
+    row = np.broadcast_to(np.arange(3 * len(mesh.faces)).reshape(-1, 3, 1, 1), rows.shape)
+    return sp.csr_array((rows.ravel(), (row.ravel(), column.ravel())), shape=(3 * len(mesh.faces), 2 * mesh.n))

@@ -11,7 +11,40 @@ from jiggle_mj.estimator.energy import Term
 from jiggle_mj.estimator.mesh import SheetMesh
 
 
-class TriangleMembrane(Term):
+class Triangles(Term):
+    """Triangles that a deformation gradient F, the same all over each, takes from rest to where their corners are."""
+
+    vertices: Int[np.ndarray, "f 3"] | Int[Array, "f 3"]
+    shape_gradient: Float[Array, "f 3 2"]
+    """Derivative of each corner's shape function along the two material axes [1/m]."""
+    area: Float[Array, " f"]
+    """Rest area [m^2]."""
+
+    def deformation(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 2"]:
+        """F."""
+        return jnp.einsum("fai,fak->fik", x, self.shape_gradient)
+
+    def strain(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3"]:
+        """Green's, whether elastic or not: (E_11, E_22, 2 E_12)."""
+        return _green(self.deformation(x))
+
+    def strain_gradient(self, F: Float[Array, "f 3 2"]) -> Float[Array, "f 3 3 3"]:
+        """Derivative of each strain, the last axis, in the corners' coordinates [1/m]."""
+        N = self.shape_gradient
+        shear = jnp.einsum("fi,fa->fai", F[:, :, 0], N[:, :, 1]) + jnp.einsum("fi,fa->fai", F[:, :, 1], N[:, :, 0])
+        return jnp.stack([*(jnp.einsum("fi,fa->fai", F[:, :, k], N[:, :, k]) for k in (0, 1)), shear], axis=-1)
+
+    def force(self, F: Float[Array, "f 3 2"], stress: Float[Array, "f 3"]) -> Float[Array, "f 3 3"]:
+        """A F S grad N, of second Piola-Kirchhoff stresses (S_11, S_22, S_12) [N]."""
+        return self.area[:, None, None] * jnp.einsum("fik,fkl,fal->fai", F, _matrix(stress), self.shape_gradient)
+
+    def geometric(self, stress: Float[Array, "f 3"], *, compressive: bool) -> Float[Array, "f 3 3 3 3"]:
+        """What a stress adds to the stiffness, by area; without `compressive` of its tensile part alone [N/m^3]."""
+        N, S = self.shape_gradient, _matrix(stress) if compressive else _tensile(_matrix(stress))
+        return jnp.einsum("fak,fkl,fbl,ij->faibj", N, S, N, jnp.eye(3, dtype=N.dtype))
+
+
+class TriangleMembrane(Triangles):
     """Constant-strain triangles in plane stress, St Venant-Kirchhoff as built.
 
     With F the deformation gradient, E = (F^T F - I) / 2 - E_0 as (E_11, E_22, 2 E_12), and w = E.C E / k, a triangle of
@@ -19,11 +52,6 @@ class TriangleMembrane(Term):
     stiffening. Axis 1 lies in the triangle and follows a world axis, the same for all of them.
     """
 
-    vertices: Int[np.ndarray, "f 3"] | Int[Array, "f 3"]
-    shape_gradient: Float[Array, "f 3 2"]
-    """Derivative of each corner's shape function along the two material axes [1/m]."""
-    area: Float[Array, " f"]
-    """Rest area [m^2]."""
     stiffness: Float[Array, ""]
     """k [N/m]."""
     poisson: Float[Array, ""]
@@ -61,10 +89,6 @@ class TriangleMembrane(Term):
             stiffening=jnp.zeros(()),
         )
 
-    def strain(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3"]:
-        """Green's, whether elastic or not: (E_11, E_22, 2 E_12)."""
-        return green(self._deformation(x))
-
     def energy(self, x: Float[Array, "f 3 3"]) -> Float[Array, " f"]:
         """[J]."""
         strain = self.strain(x) - self.inelastic
@@ -73,9 +97,9 @@ class TriangleMembrane(Term):
 
     def gradient(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3"]:
         """A F S grad N [N]."""
-        F = self._deformation(x)
+        F = self.deformation(x)
         stress, _, _ = self._stress(F)
-        return self.area[:, None, None] * jnp.einsum("fik,fkl,fal->fai", F, stress_matrix(stress), self.shape_gradient)
+        return self.force(F, stress)
 
     def hessian(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 3 3 3"]:
         """Material and geometric part [N/m]."""
@@ -85,27 +109,21 @@ class TriangleMembrane(Term):
         """The same with compressive principal stresses left out, which makes the geometric part semi-definite."""
         return self._tangent(x, compressive=False)
 
-    def _deformation(self, x: Float[Array, "f 3 3"]) -> Float[Array, "f 3 2"]:
-        return jnp.einsum("fai,fak->fik", x, self.shape_gradient)
-
     def _stress(self, F: Float[Array, "f 3 2"]) -> tuple[Float[Array, "f 3"], Float[Array, "f 3"], Float[Array, " f"]]:
         """S = (1 + a w) C E, C E, and 1 + a w [N/m]."""
-        strain = green(F) - self.inelastic
+        strain = _green(F) - self.inelastic
         linear = jnp.einsum("fpq,fq->fp", self.elasticity, strain)
         stiffer = 1 + self.stiffening * jnp.sum(strain * linear, axis=1) / self.stiffness
         return stiffer[:, None] * linear, linear, stiffer
 
     def _tangent(self, x: Float[Array, "f 3 3"], *, compressive: bool) -> Float[Array, "f 3 3 3 3"]:
-        F, N = self._deformation(x), self.shape_gradient
+        F = self.deformation(x)
         stress, linear, stiffer = self._stress(F)
         tangent = stiffer[:, None, None] * self.elasticity
         tangent = tangent + 2 * self.stiffening / self.stiffness * linear[:, :, None] * linear[:, None, :]
-        shear = jnp.einsum("fi,fa->fai", F[:, :, 0], N[:, :, 1]) + jnp.einsum("fi,fa->fai", F[:, :, 1], N[:, :, 0])
-        variation = jnp.stack([*(jnp.einsum("fi,fa->fai", F[:, :, k], N[:, :, k]) for k in (0, 1)), shear], axis=-1)
+        variation = self.strain_gradient(F)
         material = jnp.einsum("faip,fpq,fbjq->faibj", variation, tangent, variation)
-        stress = stress_matrix(stress) if compressive else tensile(stress_matrix(stress))
-        geometric = jnp.einsum("fak,fkl,fbl,ij->faibj", N, stress, N, jnp.eye(3, dtype=F.dtype))
-        return self.area[:, None, None, None, None] * (material + geometric)
+        return self.area[:, None, None, None, None] * (material + self.geometric(stress, compressive=compressive))
 
 
 def plane_stress(poisson: float | Float[Array, ""]) -> Float[Array, "3 3"]:
@@ -165,18 +183,16 @@ def material_axis(normal: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
     return np.eye(3)[0 if abs(normal[0]) <= max(abs(normal[1]), abs(normal[2])) else 1]
 
 
-def green(F: Float[Array, "f 3 2"]) -> Float[Array, "f 3"]:
-    """Green's strain (E_11, E_22, 2 E_12) of a deformation gradient."""
+def _green(F: Float[Array, "f 3 2"]) -> Float[Array, "f 3"]:
     metric = jnp.einsum("fik,fil->fkl", F, F)
     return jnp.stack([0.5 * (metric[:, 0, 0] - 1), 0.5 * (metric[:, 1, 1] - 1), metric[:, 0, 1]], axis=1)
 
 
-def stress_matrix(stress: Float[Array, "f 3"]) -> Float[Array, "f 2 2"]:
-    """From (S_11, S_22, S_12)."""
+def _matrix(stress: Float[Array, "f 3"]) -> Float[Array, "f 2 2"]:
     return stress[:, jnp.array([[0, 2], [2, 1]])]
 
 
-def tensile(stress: Float[Array, "f 2 2"]) -> Float[Array, "f 2 2"]:
+def _tensile(stress: Float[Array, "f 2 2"]) -> Float[Array, "f 2 2"]:
     """Symmetric 2x2 matrices with negative eigenvalues set to zero, in closed form."""
     mean = 0.5 * (stress[:, 0, 0] + stress[:, 1, 1])
     deviator = stress - mean[:, None, None] * jnp.eye(2, dtype=stress.dtype)[None]

@@ -27,8 +27,11 @@ def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane =
     """Membrane, bending, weight, and bed or tension of a sheet; attachments and grip are added by who uses it."""
     k, nu = declaration.membrane_stiffness, declaration.poisson
     plate = k * declaration.thickness**2 / (12 * (1 - nu**2))
-    triangles = TriangleMembrane.build(mesh, stiffness=k, poisson=nu)
-    elastic = triangles if membrane == "triangles" else EdgeMembrane.build(mesh, stiffness=k)
+    elastic = (
+        TriangleMembrane.build(mesh, stiffness=k, poisson=nu)
+        if membrane == "triangles"
+        else EdgeMembrane.build(mesh, stiffness=k)
+    )
     terms: list[Term] = [elastic, IsometricBending.build(mesh, stiffness=plate)]
     gravity = np.asarray(declaration.gravity, dtype=float)
     if gravity.any():
@@ -37,7 +40,7 @@ def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane =
         weight = Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=pull)
         terms.append(weight)
         if down is not None:
-            terms.append(Tension.build(mesh, triangles, weight))
+            terms.append(Tension.build(mesh, weight, poisson=nu))
         if declaration.bed:
             up = -gravity / np.linalg.norm(gravity)
             load = -np.asarray(weight.force) @ up

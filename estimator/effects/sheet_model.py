@@ -142,7 +142,7 @@ def undisturbed(mesh: SheetMesh, declaration: Declaration) -> SheetEnergy:
 
 def tangents(membrane: TriangleMembrane, x: Float[Array, "n 3"]) -> Float[Array, "n 3 2"]:
     """Derivative of the position along the two material axes, at each particle the mean of its triangles'."""
-    F = jnp.einsum("fai,fak->fik", x[membrane.vertices], membrane.shape_gradient)
+    F = membrane.deformation(x[membrane.vertices])
     spread = jnp.broadcast_to((membrane.area[:, None, None] * F)[:, None], (*membrane.vertices.shape, 3, 2))
     total = jnp.zeros((len(x), 3, 2), x.dtype).at[membrane.vertices].add(spread)
     around = jnp.zeros(len(x), x.dtype).at[membrane.vertices].add(membrane.area[:, None])
