@@ -13,11 +13,12 @@ EXPLAINED = 0.85
 """Share of the best log Bayes factor from which an effect counts as explaining as much."""
 BETTER, DECISIVE = 0.97, 0.8
 """Shares of the error over all parts left out that an effect must bring it to, unless it accounts for all that was left
-over or is certain, and from which on it need not beat larger errors without a cause."""
-CERTAIN, LITTLE = 30.0, 20.0
-"""Log Bayes factor from which, and what it leaves to larger errors up to which, an effect need not foretell better, but
-no worse, one part aside if there are more than two [nat]: what is felt in one grasp alone cannot be foretold by others,
-and a part that is missed by far, for attachments that only it would show, outweighs the rest."""
+over or is certain, and from which on it need be neither likely nor beat larger errors without a cause."""
+LIKELY, LITTLE = 30.0, 20.0
+"""Log Bayes factor from which an effect is added [nat]: a mesh that is not the sheet's, and noise that is not quite as
+it is taken, are worth up to 20. And what it leaves to larger errors up to which such an effect is certain [nat]: it need
+not foretell better then, but no worse, one part aside if there are more than two. What is felt in one grasp alone cannot
+be foretold by others, and a part that is missed by far, for attachments that only it would show, outweighs the rest."""
 OUTDONE = 0.75
 """Share of the log Bayes factor of one that is refused up to which a less likely effect is not added in its place."""
 
@@ -75,11 +76,13 @@ def against(best: Trial, stage: Stage, head_start: float = 0.0) -> str | None:
         return f"its size is beyond {ABSURD:g} prior standard deviations"
     before, after = _missed(stage.folds), _missed(best.folds)
     likelier = best.log_bayes_factor + head_start + best.left.gain - stage.left.gain
+    if after > DECISIVE * before and best.log_bayes_factor < LIKELY:
+        return f"it explains {best.log_bayes_factor:.0f} nat, less than the {LIKELY:g} from which one is added"
     if after > DECISIVE * before and likelier < ENTER:
         return "larger errors without a cause explain the frames as well"
     parts = list(zip(stage.folds, best.folds, strict=True))
     better = sum(b.rms < a.rms for a, b in parts)
-    certain = best.log_bayes_factor > CERTAIN and best.left.gain < LITTLE
+    certain = best.log_bayes_factor >= LIKELY and best.left.gain < LITTLE
     enough = 1.0 if certain or best.left.gain < REMAINDER < stage.left.gain else BETTER
     counted = sorted(parts, key=lambda pair: pair[1].rms / pair[0].rms)[: max(len(parts) - 1, 2)] if certain else parts
     worse = _missed([b for _, b in counted]) > enough * _missed([a for a, _ in counted])
