@@ -48,8 +48,14 @@ class AttachmentBelief(eqx.Module):
             site_shift=jnp.zeros(n),
             message=jnp.zeros(prior.neighbours.shape),
         )
+        return empty._undisturbed()
+
+    @eqx.filter_jit
+    def _undisturbed(self) -> "AttachmentBelief":
+        """What neighbours tell each other where nothing was seen."""
+        n = len(self.shift)
         nothing = jnp.zeros(n), jnp.full(n, UNKNOWN)
-        return jax.lax.fori_loop(0, 20, lambda _, belief: belief._matched(*nothing), empty)
+        return jax.lax.fori_loop(0, 20, lambda _, belief: belief._matched(*nothing), self)
 
     def bounded(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         """S of a stiffness [N/m]; 1 for infinity."""
@@ -207,6 +213,7 @@ class AttachmentBelief(eqx.Module):
         """Of the Gaussian over s [nat]."""
         return entropy(self.gaussian().factor)
 
+    @eqx.filter_jit
     def interval(self) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """Ends of the 90 % interval of each b [N/m]: from 0 where 'free' keeps 5 %, up to infinity beyond `OPEN`."""
         gaussian = self.gaussian()

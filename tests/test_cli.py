@@ -25,6 +25,15 @@ def whole(request, tmp_path_factory):
     return code, scene, out
 
 
+@pytest.fixture(scope="module")
+def particles(tmp_path_factory):
+    """A recording of the tiny scene, of particles."""
+    folder = tmp_path_factory.mktemp("particles")
+    with pytest.MonkeyPatch.context() as patch:
+        assert call(patch, "record", scene_file(folder), "--out", folder / "run.mcap", "--sensing", "particles") == 0
+    return folder / "run.mcap"
+
+
 def test_run_fills_the_folder_with_five_files(whole):
     code, _, out = whole
     assert code == 0
@@ -83,22 +92,20 @@ def test_a_truth_of_the_same_name_but_another_scene_is_refused_and_changes_nothi
     assert (made / "result.json").read_bytes() == before
 
 
-def test_a_folder_with_results_is_refused_with_2_and_replaced_on_demand(whole, tmp_path, monkeypatch, capsys):
-    _, scene, made = whole
-    before = (made / "result.json").read_bytes()
-    assert call(monkeypatch, "run", scene, "--out", made) == 2
-    assert "pass --overwrite" in capsys.readouterr().err
-    assert (made / "result.json").read_bytes() == before
+def test_a_folder_with_results_is_refused_with_2_and_replaced_on_demand(particles, tmp_path, monkeypatch, capsys):
     out = tmp_path / "old"
-    shutil.copytree(made, out)
+    shutil.copytree(particles.parent, out)
     (out / "result.json").write_text("old")
+    assert call(monkeypatch, "run", out / "tiny.toml", "--out", out) == 2
+    assert "pass --overwrite" in capsys.readouterr().err
+    assert (out / "result.json").read_text() == "old"
     assert call(monkeypatch, "estimate", out / "run.mcap", "--out", out, "--overwrite") == 0
     assert keys(json.loads((out / "result.json").read_text())) == KEYS
     assert (out / "run.mcap").exists() and (out / "run.truth.mcap").exists()
 
 
-def test_identify_prints_ratios_and_what_it_refuses(whole, monkeypatch, capsys):
-    assert call(monkeypatch, "identify", whole[2] / "run.mcap", "--json") == 0
+def test_identify_prints_ratios_and_what_it_refuses(particles, monkeypatch, capsys):
+    assert call(monkeypatch, "identify", particles, "--json") == 0
     told = capsys.readouterr()
     found = json.loads(told.out)
     assert set(found["ratios"]) == {"weight", "bending"} and "membrane stiffness" in found["refused"]

@@ -16,9 +16,10 @@ BETTER, DECISIVE = 0.97, 0.8
 over or is certain, and from which on it need be neither likely nor beat larger errors without a cause."""
 LIKELY, LITTLE = 30.0, 20.0
 """Log Bayes factor from which an effect is added [nat]: a mesh that is not the sheet's, and noise that is not quite as
-it is taken, are worth up to 20. And what it leaves to larger errors up to which such an effect is certain [nat]: it need
-not foretell better then, but no worse, one part aside if there are more than two. What is felt in one grasp alone cannot
-be foretold by others, and a part that is missed by far, for attachments that only it would show, outweighs the rest."""
+it is taken, were worth up to 26. And what it leaves to larger errors up to which such an effect is certain [nat]: it
+need not foretell better then, but no worse, one part aside if there are more than two. What is felt in one grasp alone
+cannot be foretold by others, and a part that is missed by far, for attachments that only it would show, outweighs the
+rest."""
 OUTDONE = 0.75
 """Share of the log Bayes factor of one that is refused up to which a less likely effect is not added in its place."""
 
