@@ -17,8 +17,9 @@ from jiggle_mj.estimator.attribution.closing import close_the_loop
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.attribution.fit import doubted, fit, moved
 from jiggle_mj.estimator.attribution.gather import assumed, gather
+from jiggle_mj.estimator.attribution.linear import Glance
 from jiggle_mj.estimator.attribution.problem import Problem
-from jiggle_mj.estimator.attribution.scores import bayes_factor
+from jiggle_mj.estimator.attribution.scores import bayes_factor, occam
 from jiggle_mj.estimator.attribution.sheet import closed_on, held_way, predict_all
 from jiggle_mj.estimator.attribution.still_noise import measure
 from jiggle_mj.estimator.attribution.suggestion import suggest, told_apart
@@ -124,6 +125,26 @@ def test_a_fit_finds_the_same_size_from_nothing_and_from_the_truth(light):
     assert nothing.point.theta[at] == pytest.approx(truth.point.theta[at], abs=0.03)
 
 
+def test_a_fit_ends_where_its_parameters_fit_best(light):
+    """To half a standard deviation, where all is weighed anew."""
+    problem, ended = light[0].problem, light[0].stages[-1].fitted
+    with jax.enable_x64(True), one_thread():
+        anew = fitting._reckoned(problem, ended.named, ended.point, list(ended.glances))
+        left, _ = fitting._at_hand(problem, anew)
+        sd = occam(problem, ended)[1]
+    np.testing.assert_allclose(left[ended.named] / sd, 0, atol=0.5)
+
+
+def test_normal_equations_are_carried_to_another_point():
+    rng = np.random.default_rng(0)
+    columns, tool, gone = rng.normal(size=(9, 6)), rng.normal(size=(3, 4)), np.append(rng.normal(size=5), 1.0)
+    with jax.enable_x64(True):
+        found = fitting._carried(Glance(square=jnp.asarray(columns.T @ columns), tool=jnp.asarray(tool)), gone)
+    there = np.c_[columns[:, :-1], columns @ gone]
+    np.testing.assert_allclose(found.square, there.T @ there, atol=1e-12)
+    np.testing.assert_allclose(found.tool, np.c_[tool[:, :-1], tool @ gone[2:]], atol=1e-12)
+
+
 def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
     """Where a sheet has folded, say."""
     closed, *_ = light
@@ -131,7 +152,8 @@ def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
     folded = dataclasses.replace(begun, cost=np.nan)
     there = iter([begun, folded])
     monkeypatch.setattr(fitting, "_reckoned", lambda *_: next(there))
-    monkeypatch.setattr(fitting, "_better", lambda *_: (begun.point, begun.cost - 1))
+    monkeypatch.setattr(fitting, "_better", lambda *_, **__: (begun.point, begun.cost - 1))
+    monkeypatch.setattr(fitting, "_to_its_end", lambda _, ended: ended)
     assert fit(closed.problem, begun.named, begun.point, {1}) is begun
     assert bayes_factor(closed.problem, folded, begun, 1) == (-np.inf, -np.inf)
 

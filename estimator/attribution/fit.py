@@ -112,7 +112,7 @@ def fit(
         if not np.isfinite(there.cost):
             break
         now = there
-    return now
+    return _to_its_end(problem, now)
 
 
 def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
@@ -171,6 +171,30 @@ def _found(
     )
 
 
+def _to_its_end(problem: Problem, now: Fitted) -> Fitted:
+    """One more step of the parameters alone, by what is known there already, however little it promises.
+
+    Other attachments that fit about as well may lie far off, where the weights do not hold.
+    """
+    better = _better(problem, now, [_at_hand(problem, now)], least=0.0)
+    if better is None:
+        return now
+    point, n = better[0], len(better[0].s)
+    gone = np.zeros(len(now.glances[min(now.glances)].square))
+    gone[n : n + len(now.free)], gone[-1] = (point.theta - now.point.theta)[now.free], 1.0
+    glances = {k: _carried(one, gone) for k, one in now.glances.items()}
+    return _found(problem, now.named, point, glances, now.weights)
+
+
+def _carried(glance: Glance, gone: Float[np.ndarray, " k"]) -> Glance:
+    """A frame's normal equations about a point that is so far off, 1 at the end, as linear as they are."""
+    square, tool = np.array(glance.square), np.array(glance.tool)
+    square[:, -1] = square @ gone
+    square[-1] = gone @ square
+    tool[:, -1] = tool @ gone[-tool.shape[1] :]
+    return Glance(square=jnp.asarray(square), tool=jnp.asarray(tool))
+
+
 def _better(problem: Problem, now: Fitted, steps: list[Step], *, least: float = GAIN) -> tuple[Point, float] | None:
     """A point where the cost is less, and that; None if normal equations promise no more than `least` of it.
 
@@ -213,17 +237,23 @@ def _steps(problem: Problem, now: Fitted, *, together: bool = True) -> list[Step
     Each with the parameters that fit it best. Where any of many may carry a load, none of them is likelier attached
     than not, and yet one must be.
     """
+    found = problem.prior.bounded(jnp.where(now.stated.probability > 0.5, now.stated.b, 0.0))
+    steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now)]
+    return [*steps, _towards(problem, now, np.asarray(likeliest(now.belief)))] if together else steps
+
+
+def _at_hand(problem: Problem, now: Fitted) -> Step:
+    """Of the parameters alone."""
+    return _towards(problem, now, now.point.s)
+
+
+def _towards(problem: Problem, now: Fitted, to: Float[np.ndarray, " n"]) -> Step:
+    """To some s, with the parameters that fit it best."""
     point, free, sd = now.point, now.free, problem.sd(now.named)
     A, C, gt = _of_parameters(now.square, point, free, sd)
-
-    def step(to: Float[np.ndarray, " n"]) -> Step:
-        theta = np.zeros(len(point.theta))
-        theta[free] = np.clip(-np.linalg.solve(A, gt + C.T @ (to - point.s)), -FAR * sd, FAR * sd)
-        return theta, to - point.s
-
-    found = np.asarray(problem.prior.bounded(jnp.where(now.stated.probability > 0.5, now.stated.b, 0.0)))
-    steps = [step(found), step(point.s)]
-    return [*steps, step(np.asarray(likeliest(now.belief)))] if together else steps
+    theta = np.zeros(len(point.theta))
+    theta[free] = np.clip(-np.linalg.solve(A, gt + C.T @ (to - point.s)), -FAR * sd, FAR * sd)
+    return theta, to - point.s
 
 
 def _stated(problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> Stated:
