@@ -77,10 +77,11 @@ def against(best: Trial, stage: Stage, head_start: float = 0.0) -> str | None:
         return f"its size is beyond {ABSURD:g} prior standard deviations"
     before, after = _missed(stage.folds), _missed(best.folds)
     likelier = best.log_bayes_factor + head_start + best.left.gain - stage.left.gain
-    if after > DECISIVE * before and best.log_bayes_factor < LIKELY:
-        return f"it explains {best.log_bayes_factor:.0f} nat, less than the {LIKELY:g} from which one is added"
-    if after > DECISIVE * before and likelier < ENTER:
-        return "larger errors without a cause explain the frames as well"
+    if after > DECISIVE * before:
+        if best.log_bayes_factor < LIKELY:
+            return f"it explains {best.log_bayes_factor:.0f} nat, less than the {LIKELY:g} from which one is added"
+        if likelier < ENTER:
+            return "larger errors without a cause explain the frames as well"
     parts = list(zip(stage.folds, best.folds, strict=True))
     better = sum(b.rms < a.rms for a, b in parts)
     certain = best.log_bayes_factor >= LIKELY and best.left.gain < LITTLE

@@ -123,7 +123,8 @@ def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
     """
     left = [k for k in fitted.glances if problem.history.frames[k].part != part]
     glances, weights = {k: fitted.glances[k] for k in left}, {k: fitted.weights[k] for k in left}
-    now = _found(problem, fitted.named, fitted.point, glances, weights)
+    cost = _cost(problem, weights, fitted.point, fitted.named)
+    now = _found(problem, fitted.named, fitted.point, glances, weights, cost)
     better = _better(problem, now, _steps(problem, now, together=False), least=0.0)
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
@@ -151,11 +152,17 @@ def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[in
     """A point with what is known there."""
     along = directions(problem, problem.free(named))
     weights = weighed(problem, point, frames)
-    return _found(problem, named, point, linearised(problem, point, weights, along), weights)
+    glances = linearised(problem, point, weights, along)
+    return _found(problem, named, point, glances, weights, _cost(problem, weights, point, named))
 
 
 def _found(
-    problem: Problem, named: np.ndarray, point: Point, glances: dict[int, Glance], weights: dict[int, Metric]
+    problem: Problem,
+    named: np.ndarray,
+    point: Point,
+    glances: dict[int, Glance],
+    weights: dict[int, Metric],
+    cost: float,
 ) -> Fitted:
     free, sd = problem.free(named), problem.sd(named)
     square = reduced(problem, glances, len(free))
@@ -167,7 +174,7 @@ def _found(
         glances=glances,
         weights=weights,
         stated=_stated(problem, square, point, free, sd),
-        cost=_cost(problem, weights, point, named),
+        cost=cost,
     )
 
 
@@ -179,11 +186,12 @@ def _to_its_end(problem: Problem, now: Fitted) -> Fitted:
     better = _better(problem, now, [_at_hand(problem, now)], least=0.0)
     if better is None:
         return now
-    point, n = better[0], len(better[0].s)
+    point, cost = better
+    n = len(point.s)
     gone = np.zeros(len(now.glances[min(now.glances)].square))
     gone[n : n + len(now.free)], gone[-1] = (point.theta - now.point.theta)[now.free], 1.0
     glances = {k: _carried(one, gone) for k, one in now.glances.items()}
-    return _found(problem, now.named, point, glances, now.weights)
+    return _found(problem, now.named, point, glances, now.weights, cost)
 
 
 def _carried(glance: Glance, gone: Float[np.ndarray, " k"]) -> Glance:
