@@ -183,15 +183,17 @@ def _to_its_end(problem: Problem, now: Fitted) -> Fitted:
 
     Other attachments that fit about as well may lie far off, where the weights do not hold.
     """
-    better = _better(problem, now, [_at_hand(problem, now)], least=0.0)
-    if better is None:
+    theta, s = _after(problem, now, _at_hand(problem, now), 1.0)
+    point = start(problem, theta, s, now.point.states, list(now.glances))
+    cost = _cost(problem, now.weights, point, now.named)
+    if not cost < now.cost:
         return now
-    point, cost = better
-    n = len(point.s)
+    n = len(s)
     gone = np.zeros(len(now.glances[min(now.glances)].square))
-    gone[n : n + len(now.free)], gone[-1] = (point.theta - now.point.theta)[now.free], 1.0
+    gone[n : n + len(now.free)], gone[-1] = (theta - now.point.theta)[now.free], 1.0
     glances = {k: _carried(one, gone) for k, one in now.glances.items()}
-    return _found(problem, now.named, point, glances, now.weights, cost)
+    square = reduced(problem, glances, len(now.free))
+    return replace(now, point=point, glances=glances, square=square, cost=cost)
 
 
 def _carried(glance: Glance, gone: Float[np.ndarray, " k"]) -> Glance:
