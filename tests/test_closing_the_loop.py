@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.attribution import fit as fitting
+from jiggle_mj.estimator.attribution import leftover as leaving
 from jiggle_mj.estimator.attribution import sheet as predicting
 from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
 from jiggle_mj.estimator.attribution.closing import close_the_loop
@@ -156,6 +157,17 @@ def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
     monkeypatch.setattr(fitting, "_to_its_end", lambda _, ended: ended)
     assert fit(closed.problem, begun.named, begun.point, {1}) is begun
     assert bayes_factor(closed.problem, folded, begun, 1) == (-np.inf, -np.inf)
+
+
+def test_errors_no_larger_than_the_usual_gain_nothing_wherever_a_last_step_went(light, monkeypatch):
+    problem, fitted = light[0].problem, light[0].stages[0].fitted
+    at, gains = problem.sheet.place("stretch"), []
+    with jax.enable_x64(True), one_thread():
+        stepped = dataclasses.replace(fitted, point=moved(problem, fitted, at, fitted.point.theta[at] + 0.2))
+        for variances in ((1.0,), (1.0, 1.0 + 1e-9)):
+            monkeypatch.setattr(leaving, "VARIANCES", variances)
+            gains.append(leaving.leftover(problem, stepped).gain)
+    assert gains[1] == pytest.approx(gains[0], abs=1e-3)
 
 
 def test_frames_that_are_doubted_say_less_of_the_attachments(light):

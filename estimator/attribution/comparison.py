@@ -16,7 +16,7 @@ BETTER, DECISIVE = 0.97, 0.8
 over or is certain, and from which on it need be neither likely nor beat larger errors without a cause."""
 LIKELY, LITTLE = 30.0, 20.0
 """Log Bayes factor from which an effect is added [nat]: a mesh that is not the sheet's, and noise that is not quite as
-it is taken, were worth up to 26, and left 40 over at most; so not one that accounts for more. And what it leaves to larger errors up to which such an effect is certain [nat]: it
+it is taken, were worth up to 26. And what it leaves to larger errors up to which such an effect is certain [nat]: it
 need not foretell better then, but no worse, one part aside if there are more than two. What is felt in one grasp alone
 cannot be foretold by others, and a part that is missed by far, for attachments that only it would show, outweighs the
 rest."""
@@ -77,8 +77,7 @@ def against(best: Trial, stage: Stage, head_start: float = 0.0) -> str | None:
         return f"its size is beyond {ABSURD:g} prior standard deviations"
     before, after = _missed(stage.folds), _missed(best.folds)
     likelier = best.log_bayes_factor + head_start + best.left.gain - stage.left.gain
-    accounted_for = best.left.gain < REMAINDER < stage.left.gain
-    if after > DECISIVE * before and not accounted_for:
+    if after > DECISIVE * before:
         if best.log_bayes_factor < LIKELY:
             return f"it explains {best.log_bayes_factor:.0f} nat, less than the {LIKELY:g} from which one is added"
         if likelier < ENTER:
@@ -86,7 +85,7 @@ def against(best: Trial, stage: Stage, head_start: float = 0.0) -> str | None:
     parts = list(zip(stage.folds, best.folds, strict=True))
     better = sum(b.rms < a.rms for a, b in parts)
     certain = best.log_bayes_factor >= LIKELY and best.left.gain < LITTLE
-    enough = 1.0 if certain or accounted_for else BETTER
+    enough = 1.0 if certain or best.left.gain < REMAINDER < stage.left.gain else BETTER
     counted = sorted(parts, key=lambda pair: pair[1].rms / pair[0].rms)[: max(len(parts) - 1, 2)] if certain else parts
     worse = _missed([b for _, b in counted]) > enough * _missed([a for a, _ in counted])
     if parts and (worse or 2 * better < len(parts)):

@@ -43,12 +43,14 @@ class Fitted:
     """The end of a fit."""
 
     point: Point
+    around: Point
+    """Where weights were reckoned and frames linearised: `point`, or a step before it."""
     named: np.ndarray
     """Parameters of the effects that are taken to be there."""
     free: np.ndarray
     """All that were fitted, the sheet's own among them."""
     square: Float[np.ndarray, "k k"]
-    """Normal equations there, over s, the free parameters and -1."""
+    """Normal equations, over s, the free parameters and -1."""
     glances: dict[int, Glance]
     weights: dict[int, Metric]
     """By frame."""
@@ -124,7 +126,7 @@ def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
     left = [k for k in fitted.glances if problem.history.frames[k].part != part]
     glances, weights = {k: fitted.glances[k] for k in left}, {k: fitted.weights[k] for k in left}
     cost = _cost(problem, weights, fitted.point, fitted.named)
-    now = _found(problem, fitted.named, fitted.point, glances, weights, cost)
+    now = replace(_found(problem, fitted.named, fitted.point, glances, weights, cost), around=fitted.around)
     better = _better(problem, now, _steps(problem, now, together=False), least=0.0)
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
@@ -168,6 +170,7 @@ def _found(
     square = reduced(problem, glances, len(free))
     return Fitted(
         point=point,
+        around=point,
         named=named,
         free=free,
         square=square,

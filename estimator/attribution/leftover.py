@@ -43,7 +43,7 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
         if likelihoods and max(likelihoods, key=lambda key: likelihoods[key])[0] < variance / RATIO:
             break
         wider = problem.widened(variance, problem.amplitude)
-        weights = fitted.weights if variance == 1.0 else weighed(wider, fitted.point, list(fitted.weights))
+        weights = fitted.weights if variance == 1.0 else weighed(wider, fitted.around, list(fitted.weights))
         whole = sum(float(_log_determinant(one)) for one in weights.values())
         fields = [
             np.sum([np.asarray(weights[k].among) for k in frames], axis=0)

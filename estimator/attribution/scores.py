@@ -49,7 +49,7 @@ class Score:
 def scores(problem: Problem, fitted: Fitted) -> list[Score]:
     """Every effect of the library that was not fitted already, the likeliest first."""
     n, every = len(fitted.site_precision), directions(problem, np.arange(problem.sheet.size))
-    glances = linearised(problem, fitted.point, fitted.weights, every)
+    glances = linearised(problem, fitted.around, fitted.weights, every)
     square = reduced(problem, glances, problem.sheet.size)
     left, whole = without_stiffnesses(square, fitted.site_precision), square[n:, n:]
     found = [
@@ -92,7 +92,7 @@ def _one(
     rest, sd_rest = fitted.free[others], problem.sd(fitted.named)[others]
     free = left[np.ix_(rest, rest)] + np.diag(sd_rest**-2)
     pulled = left[np.ix_(rest, np.append(mine, len(left) - 1))]
-    pulled[:, -1] += fitted.point.theta[rest] / sd_rest**2
+    pulled[:, -1] += fitted.around.theta[rest] / sd_rest**2
     pull = np.linalg.solve(free, pulled)
     V = left[np.ix_(mine, mine)] - left[np.ix_(mine, rest)] @ pull[:, :-1]
     g = -(left[mine, -1] - left[np.ix_(mine, rest)] @ pull[:, -1])
