@@ -159,12 +159,11 @@ def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
     assert bayes_factor(closed.problem, folded, begun, 1) == (-np.inf, -np.inf)
 
 
-@pytest.mark.parametrize("gone", [-0.2, 0.2])
-def test_errors_no_larger_than_the_usual_gain_nothing_wherever_a_last_step_went(light, monkeypatch, gone):
+def test_errors_no_larger_than_the_usual_gain_nothing_wherever_a_last_step_went(light, monkeypatch):
     problem, fitted = light[0].problem, light[0].stages[0].fitted
     at, gains = problem.sheet.place("stretch"), []
     with jax.enable_x64(True), one_thread():
-        stepped = dataclasses.replace(fitted, point=moved(problem, fitted, at, fitted.point.theta[at] + gone))
+        stepped = dataclasses.replace(fitted, point=moved(problem, fitted, at, fitted.point.theta[at] - 0.2))
         for variances in ((1.0,), (1.0, 1.0 + 1e-9)):
             monkeypatch.setattr(leaving, "VARIANCES", variances)
             gains.append(leaving.leftover(problem, stepped).gain)
