@@ -184,7 +184,8 @@ def _found(
 def _to_its_end(problem: Problem, now: Fitted) -> Fitted:
     """One more step of the parameters alone, by what is known there already, however little it promises.
 
-    Other attachments that fit about as well may lie far off, where the weights do not hold.
+    Other attachments that fit about as well may lie far off, where the weights do not hold. What is believed of them is
+    so whatever the parameters are.
     """
     theta, s = _after(problem, now, _at_hand(problem, now), 1.0)
     point = start(problem, theta, s, now.point.states, list(now.glances))
