@@ -153,7 +153,7 @@ def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
     folded = dataclasses.replace(begun, cost=np.nan)
     there = iter([begun, folded])
     monkeypatch.setattr(fitting, "_reckoned", lambda *_: next(there))
-    monkeypatch.setattr(fitting, "_better", lambda *_, **__: (begun.point, begun.cost - 1))
+    monkeypatch.setattr(fitting, "_better", lambda *_: (begun.point, begun.cost - 1))
     monkeypatch.setattr(fitting, "_to_its_end", lambda _, ended: ended)
     assert fit(closed.problem, begun.named, begun.point, {1}) is begun
     assert bayes_factor(closed.problem, folded, begun, 1) == (-np.inf, -np.inf)

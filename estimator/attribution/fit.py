@@ -125,8 +125,7 @@ def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
     """
     left = [k for k in fitted.glances if problem.history.frames[k].part != part]
     glances, weights = {k: fitted.glances[k] for k in left}, {k: fitted.weights[k] for k in left}
-    cost = _cost(problem, weights, fitted.point, fitted.named)
-    now = replace(_found(problem, fitted.named, fitted.point, glances, weights, cost), around=fitted.around)
+    now = replace(_found(problem, fitted.named, fitted.point, glances, weights), around=fitted.around)
     better = _better(problem, now, _steps(problem, now, together=False), least=0.0)
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
@@ -154,17 +153,11 @@ def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[in
     """A point with what is known there."""
     along = directions(problem, problem.free(named))
     weights = weighed(problem, point, frames)
-    glances = linearised(problem, point, weights, along)
-    return _found(problem, named, point, glances, weights, _cost(problem, weights, point, named))
+    return _found(problem, named, point, linearised(problem, point, weights, along), weights)
 
 
 def _found(
-    problem: Problem,
-    named: np.ndarray,
-    point: Point,
-    glances: dict[int, Glance],
-    weights: dict[int, Metric],
-    cost: float,
+    problem: Problem, named: np.ndarray, point: Point, glances: dict[int, Glance], weights: dict[int, Metric]
 ) -> Fitted:
     free, sd = problem.free(named), problem.sd(named)
     square = reduced(problem, glances, len(free))
@@ -177,7 +170,7 @@ def _found(
         glances=glances,
         weights=weights,
         stated=_stated(problem, square, point, free, sd),
-        cost=cost,
+        cost=_cost(problem, weights, point, named),
     )
 
 
