@@ -1,7 +1,8 @@
 """Settings that every test shares: offscreen OpenGL, JAX on the CPU in float64, strict promotion, checked signatures.
 
 The environment is set before mujoco or jax is imported, which is when they read it. What one process of a run has
-compiled, the others take over. Compiled in a hurry, as no test runs long: a quarter of the time.
+compiled, the others take over. Compiled in a hurry, as no test runs long, and by one thread, as there are as many
+processes as cores: a quarter of the time.
 """
 
 import os
@@ -9,7 +10,9 @@ import tempfile
 
 os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL") or "egl"
 os.environ["JAX_PLATFORMS"] = "cpu"
-os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+os.environ["XLA_FLAGS"] = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
 if "PYTEST_XDIST_WORKER" not in os.environ:
     compiled = tempfile.TemporaryDirectory()
     os.environ["JAX_COMPILATION_CACHE_DIR"] = compiled.name
