@@ -1,8 +1,8 @@
 """Settings that every test shares: offscreen OpenGL, JAX on the CPU in float64, strict promotion, checked signatures.
 
 The environment is set before mujoco or jax is imported, which is when they read it. What one process of a run has
-compiled, the others take over. Compiled in a hurry, as no test runs long, and by one thread, as there are as many
-processes as cores: a quarter of the time.
+compiled, the others take over. Compiled in a hurry, as no test runs long: a quarter of the time; and by one thread,
+as there is a process for each core.
 """
 
 import os
