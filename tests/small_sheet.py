@@ -119,7 +119,7 @@ def at_rest(
     """A sheet's model without effects, and a moment when it lies as ever, whatever the tool says."""
     x = jnp.asarray(mesh.rest)
     model = SheetModel(
-        energy=undisturbed(mesh, declared), tool=jnp.zeros(3), view=centred(mesh.rest), time=jnp.asarray(at)
+        energy=undisturbed(mesh, declared), tool=jnp.zeros(3), view=centred(mesh), time=jnp.asarray(at)
     )
     moment = Moment(
         rest=x,

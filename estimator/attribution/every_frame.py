@@ -12,7 +12,7 @@ from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects.sheet_model import Moment
 from jiggle_mj.estimator.side_by_side import T, side_by_side
 
-DIRECTIONS = 21
+DIRECTIONS = 22
 """Parameters that are fitted together, in most fits at most."""
 
 

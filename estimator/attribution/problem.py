@@ -22,6 +22,7 @@ OWN = {
     "friction": (0.05,),
     "material_damping": (0.03,),
     "image_latency": (0.02,),
+    "surface_height": (5e-4,),
 }
 """What may be a little off in any sheet, and is no effect: standard deviations in the effects' units."""
 FORCE_VARIANCE = 0.04
@@ -55,7 +56,7 @@ class Problem:
         energy = undisturbed(mesh, estimator.declaration)
         balance = force_balance(mesh, energy, estimator.declaration, estimator.config).widened(FORCE_VARIANCE)
         library = tuple(effect for effect in library if estimator.declaration.hangs or not effect.hanging)
-        sheet = Sheet(balance=balance, view=centred(mesh.rest), library=library)
+        sheet = Sheet(balance=balance, view=centred(mesh), library=library)
         own = {name: sd for name, sd in OWN.items() if any(effect.name == name for effect in library)}
         return cls(
             sheet=sheet,

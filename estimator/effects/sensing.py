@@ -68,6 +68,11 @@ def _point_slip(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) ->
     return eqx.tree_at(lambda one: one.view.followed, model, Followed.at(jnp.asarray(membrane.vertices), place, to))
 
 
+def _surface_height(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+    """The surface that is seen lies theta above the middle of the sheet."""
+    return eqx.tree_at(lambda one: one.view.height, model, model.view.height + theta[0])
+
+
 def _since(began: Float[Array, ""], moment: Moment) -> Float[Array, ""]:
     """How long it has lasted [s]."""
     return jnp.maximum(moment.time - began, 0.0)
@@ -192,5 +197,13 @@ SENSING = (
         source="a tracker that loses millimetres in ten seconds",
         confounded_with=("camera_drift",),
         sensing=True,
+    ),
+    Effect(
+        name="surface_height",
+        acts=_surface_height,
+        units=("m",),
+        prior_sd=(5e-4,),
+        source="half of a sheet's thickness",
+        confounded_with=("gravity", "bending"),
     ),
 )

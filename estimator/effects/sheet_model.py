@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 from jiggle_mj.estimator.block_tridiagonal import Layout
 from jiggle_mj.estimator.effects.followed import Followed
@@ -30,7 +29,11 @@ STOOD = 1e-4
 
 
 class View(eqx.Module):
-    """How positions are seen: `shift` + `centre` + `turn` (x - `centre`), of what is followed."""
+    """How positions are seen: `shift` + `centre` + `turn` (x - `centre`), of what is followed on the sheet's surface.
+
+    The surface lies above the sheet's middle, where its forces are, and a sheet that turns takes it along. At rest it
+    is where the sheet was seen, so that particles at x have theirs at x + `height` (normal - `lying`).
+    """
 
     centre: Float[Array, " 3"]
     """The middle of the sheet at rest [m]."""
@@ -38,10 +41,14 @@ class View(eqx.Module):
     shift: Float[Array, " 3"]
     """[m]."""
     followed: Followed
+    height: Float[Array, ""]
+    """Of the surface over the middle [m]."""
+    lying: Float[Array, "n 3"]
+    """Normals at rest."""
 
     def __call__(self, x: Float[Array, "n 3"], *, tangents: Float[Array, "n 3 2"]) -> Float[Array, "n 3"]:
         """Where what is followed is seen, for particles at x and the sheet's derivatives there."""
-        return self.moved(self.followed(x, tangents))
+        return self.moved(self.followed(x + self.height * (_normals(tangents) - self.lying), tangents))
 
     def moved(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Where points at x are seen."""
@@ -159,11 +166,20 @@ def extent(place: Float[Array, "n 2"]) -> tuple[Float[Array, "1 2"], Float[Array
     return jnp.min(place, axis=0, keepdims=True), jnp.max(place, axis=0, keepdims=True)
 
 
-def centred(rest: Float[np.ndarray, "n 3"]) -> View:
+def centred(mesh: SheetMesh) -> View:
     """As it is."""
+    membrane = TriangleMembrane.build(mesh, stiffness=1.0, poisson=0.0)
     return View(
-        centre=jnp.asarray(rest.mean(axis=0)),
+        centre=jnp.asarray(mesh.rest.mean(axis=0)),
         turn=jnp.eye(3),
         shift=jnp.zeros(3),
-        followed=Followed.themselves(len(rest)),
+        followed=Followed.themselves(mesh.n),
+        height=jnp.zeros(()),
+        lying=_normals(tangents(membrane, jnp.asarray(mesh.rest))),
     )
+
+
+def _normals(tangents: Float[Array, "n 3 2"]) -> Float[Array, "n 3"]:
+    """Unit normals on the side from which triangles run counter-clockwise."""
+    normal = jnp.cross(tangents[:, :, 0], tangents[:, :, 1])
+    return normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
