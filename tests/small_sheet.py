@@ -118,9 +118,7 @@ def at_rest(
 ) -> tuple[SheetModel, Moment]:
     """A sheet's model without effects, and a moment when it lies as ever, whatever the tool says."""
     x = jnp.asarray(mesh.rest)
-    model = SheetModel(
-        energy=undisturbed(mesh, declared), tool=jnp.zeros(3), view=centred(mesh), time=jnp.asarray(at)
-    )
+    model = SheetModel(energy=undisturbed(mesh, declared), tool=jnp.zeros(3), view=centred(mesh), time=jnp.asarray(at))
     moment = Moment(
         rest=x,
         time=jnp.asarray(at),

@@ -255,9 +255,7 @@ def test_nothing_slides_at_zero_over_a_sheet_that_was_bent_and_turned_at_rest(pl
         bent = np.column_stack([flat[:, 0], flat[:, 1], 4 * flat[:, 0] ** 2])
         turned = bent @ Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix().T
         mesh = SheetMesh(turned, sheet().faces)
-        model = SheetModel(
-            energy=undisturbed(mesh, DECLARATION), tool=plain.tool, view=centred(mesh), time=plain.time
-        )
+        model = SheetModel(energy=undisturbed(mesh, DECLARATION), tool=plain.tool, view=centred(mesh), time=plain.time)
         there = dataclasses.replace(moment, rest=jnp.asarray(turned))
         for theta in (0.0, 1e-12):
             view = EFFECTS["point_slip"].acts(model, jnp.full(3, theta), there).view
