@@ -170,6 +170,16 @@ def test_errors_no_larger_than_the_usual_gain_nothing_wherever_a_last_step_went(
     assert gains[1] == pytest.approx(gains[0], abs=1e-3)
 
 
+def test_smaller_errors_than_the_usual_leave_nothing_over(light, monkeypatch):
+    """Of smooth force fields 16 times as large as they are taken to be."""
+    problem, fitted = light[0].problem, light[0].stages[-1].fitted
+    monkeypatch.setattr(leaving, "VARIANCES", (1.0,))
+    with jax.enable_x64(True), one_thread():
+        found = leaving.leftover(problem.widened(1.0, 16 * problem.amplitude), fitted)
+    assert found.amplitude < 1
+    assert found.gain == pytest.approx(leaving._of_tool(problem, fitted)[1])
+
+
 def test_frames_that_are_doubted_say_less_of_the_attachments(light):
     closed, *_ = light
     fitted = closed.stages[-1].fitted

@@ -27,7 +27,7 @@ class Leftover:
     """The likeliest of those errors."""
 
     gain: float
-    """By how much the frames are likelier with them than with the usual ones [nat]."""
+    """By how much the frames are likelier with them than with the usual ones, or smaller ones [nat]."""
     variance: float
     """Of the forces, in units of the usual."""
     amplitude: float
@@ -55,7 +55,8 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
             cost = cost_under(wider.widened(1.0, amplitude), weights, fitted.point)
             likelihoods[variance, ratio] = -(cost + whole + common) / 2
     best = max(likelihoods, key=lambda key: likelihoods[key])
-    gain = likelihoods[best] - likelihoods[1.0, 1.0]
+    no_larger = max(found for (variance, ratio), found in likelihoods.items() if variance == 1.0 and ratio <= 1.0)
+    gain = likelihoods[best] - no_larger
     tool, gain_of_tool = _of_tool(problem, fitted)
     return Leftover(gain=float(gain + gain_of_tool), variance=best[0], amplitude=best[1], tool_variance=tool)
 
