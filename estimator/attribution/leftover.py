@@ -55,7 +55,7 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
             cost = cost_under(wider.widened(1.0, amplitude), weights, fitted.point)
             likelihoods[variance, ratio] = -(cost + whole + common) / 2
     best = max(likelihoods, key=lambda key: likelihoods[key])
-    no_larger = max(found for (variance, ratio), found in likelihoods.items() if variance == 1.0 and ratio <= 1.0)
+    no_larger = max(likelihoods[1.0, ratio] for ratio in AMPLITUDES if ratio <= 1.0)
     gain = likelihoods[best] - no_larger
     tool, gain_of_tool = _of_tool(problem, fitted)
     return Leftover(gain=float(gain + gain_of_tool), variance=best[0], amplitude=best[1], tool_variance=tool)
