@@ -19,10 +19,10 @@ from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.attribution.fit import doubted, fit, moved
 from jiggle_mj.estimator.attribution.gather import assumed, gather
 from jiggle_mj.estimator.attribution.linear import Glance
-from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.scores import bayes_factor, occam
 from jiggle_mj.estimator.attribution.sheet import closed_on, held_way, predict_all
-from jiggle_mj.estimator.attribution.still_noise import measure
+from jiggle_mj.estimator.attribution.still_noise import MODES, STEP, StillNoise, measure
 from jiggle_mj.estimator.attribution.suggestion import suggest, told_apart
 from jiggle_mj.estimator.attribution.trials import jackknife_sd
 from jiggle_mj.estimator.attribution.users_effects import check_effects
@@ -365,6 +365,34 @@ def test_noise_is_measured_from_still_frames_with_its_smooth_part():
     fields, white = noise.fields(rest)
     total = np.sum(fields**2, axis=1) + white**2
     assert total.mean() == pytest.approx(noise.sd**2 + noise.smooth_sd**2, rel=0.02)
+
+
+def test_what_neighbours_share_counts_as_white_where_it_is_little_beside_the_rest():
+    rest = sheet().rest
+    nearly_white = StillNoise(sd=2e-4, smooth_sd=4e-5, length=0.004, frames=9)
+    fields, white = nearly_white.fields(rest)
+    assert fields.shape == (len(rest), 0)
+    assert white == pytest.approx(np.hypot(nearly_white.sd, nearly_white.smooth_sd))
+    shared = StillNoise(sd=1e-4, smooth_sd=2e-4, length=0.02, frames=9).fields(rest)[0]
+    assert shared.shape[1] % STEP == 0
+    assert 0 < np.sum(np.any(shared != 0, axis=0)) <= MODES
+
+
+@pytest.mark.parametrize(
+    ("costs", "least", "passes"), [((100, 90, 95, 93, 80), 90, 3), ((100, 90, 95, 80, 85, 70), 70, 5)]
+)
+def test_a_fit_that_leads_away_and_back_is_taken_where_it_cost_least(monkeypatch, costs, least, passes):
+    points = [object.__new__(fitting.Fitted) for _ in costs]
+    for point, cost in zip(points, costs, strict=True):
+        object.__setattr__(point, "cost", float(cost))
+    reckoned = iter(points)
+    monkeypatch.setattr(Problem, "frames", lambda self, parts: [])
+    monkeypatch.setattr(fitting, "_reckoned", lambda *_: next(reckoned))
+    monkeypatch.setattr(fitting, "_steps", lambda *_: [])
+    monkeypatch.setattr(fitting, "_better", lambda problem, now, steps: (object.__new__(Point), now.cost - 5))
+    monkeypatch.setattr(fitting, "_to_its_end", lambda problem, now: now)
+    nothing, named = object.__new__(Problem), np.zeros(0, dtype=int)
+    assert fit(nothing, named, object.__new__(Point), {0}, passes=passes).cost == least
 
 
 def test_a_jump_between_still_frames_is_no_noise():

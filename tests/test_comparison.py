@@ -164,10 +164,12 @@ def test_each_but_the_last_is_compared_again_with_what_was_tried_in_its_place(mo
 
 
 def test_what_was_not_told_from_an_effect_that_is_dropped_is_still_not_told_from_it(monkeypatch):
+    """And what was far less likely than that one was only beside it as good as the one that stays."""
     first, second, third = (trial(name, 300.0, 0.5) for name in ("gravity", "stretch", "friction"))
+    rivals, bending = [trial("bending", 250.0, 0.5), trial("bed", 250.0, 0.5)], trial("bending", 200.0, 0.5)
     added = [
-        search.Added(trial=first, rivals=[trial("stretch", 250.0, 0.5)], others=[]),
-        search.Added(trial=second, rivals=[trial("bending", 250.0, 0.5)], others=[]),
+        search.Added(trial=first, rivals=[trial("stretch", 250.0, 0.5)], others=[(bending, "foretells worse")]),
+        search.Added(trial=second, rivals=rivals, others=[]),
         search.Added(trial=third, rivals=[], others=[]),
     ]
     needless = trial("gravity", -16.0, 0.5)

@@ -47,19 +47,27 @@ def linearised(
 
 def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> float:
     """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
-    total, theta = 0.0, jnp.asarray(point.theta)
+    return cost(problem, weights, missed(problem, weights, point), problem.amplitude)
+
+
+def missed(problem: Problem, weights: dict[int, Metric], point: Point) -> dict[int, Misfit]:
+    """How a point's predictions miss every frame, under weights that were reckoned elsewhere."""
+    theta = jnp.asarray(point.theta)
 
     def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Misfit:
         return misfit(problem.sheet, weights[k], theta, frame, moment, x)
 
-    every = _each(problem, point, weights, one)
+    return _each(problem, point, weights, one)
+
+
+def cost(problem: Problem, weights: dict[int, Metric], every: dict[int, Misfit], amplitude: float) -> float:
+    """Twice what frames are missed by together [nat], with smooth force fields of that amplitude."""
+    total = 0.0
     for frames in problem.by_part(weights).values():
-        missed = [every[k] for k in frames]
-        tool = np.array([np.asarray(one.tool)[:, None] for one in missed])
-        fields = np.sum([np.asarray(one.fields) for one in missed], axis=0)
-        middle = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
-        middle += np.eye(N_FIELDS) / problem.amplitude**2
-        total += sum(float(one.squared) for one in missed)
+        tool = np.array([np.asarray(every[k].tool)[:, None] for k in frames])
+        fields = np.sum([np.asarray(every[k].fields) for k in frames], axis=0)
+        middle = np.sum([np.asarray(weights[k].among) for k in frames], axis=0) + np.eye(N_FIELDS) / amplitude**2
+        total += sum(float(every[k].squared) for k in frames)
         total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0]
         total -= fields @ np.linalg.solve(middle, fields)
     return float(total)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
-from jiggle_mj.estimator.attribution.every_frame import cost_under, weighed
+from jiggle_mj.estimator.attribution.every_frame import cost, missed, weighed
 from jiggle_mj.estimator.attribution.fit import Fitted
 from jiggle_mj.estimator.attribution.linear import N_FIELDS, Metric
 from jiggle_mj.estimator.attribution.normal_equations import less_offset
@@ -44,6 +44,7 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
             break
         wider = problem.widened(variance, problem.amplitude)
         weights = fitted.weights if variance == 1.0 else weighed(wider, fitted.around, list(fitted.weights))
+        every = missed(wider, weights, fitted.point)
         whole = sum(float(_log_determinant(one)) for one in weights.values())
         fields = [
             np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
@@ -52,8 +53,7 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
         for ratio in AMPLITUDES:
             amplitude = ratio * problem.amplitude
             common = sum(np.linalg.slogdet(np.eye(N_FIELDS) + amplitude**2 * one)[1] for one in fields)
-            cost = cost_under(wider.widened(1.0, amplitude), weights, fitted.point)
-            likelihoods[variance, ratio] = -(cost + whole + common) / 2
+            likelihoods[variance, ratio] = -(cost(problem, weights, every, amplitude) + whole + common) / 2
     best = max(likelihoods, key=lambda key: likelihoods[key])
     no_larger = max(likelihoods[1.0, ratio] for ratio in AMPLITUDES if ratio <= 1.0)
     gain = likelihoods[best] - no_larger

@@ -50,13 +50,22 @@ class Metric(eqx.Module):
     """I + F^T H^T N^-1 H F, its lower Cholesky factor."""
     fields: Float[Array, "n 3 q"]
     """Q."""
+    white: Float[Array, "n 3 q"]
+    """N^-1 Q."""
     among: Float[Array, "q q"]
     """Q^T (N + H F F^T H^T)^-1 Q."""
 
-    def dot(self, left: Float[Array, "n 3 l"], right: Float[Array, "n 3 r"]) -> Float[Array, "l r"]:
-        """left^T (N + H F F^T H^T)^-1 right."""
-        white = _each(partial(self.balance.whitened, self.frame), right)
-        return self._less(left, right, jnp.einsum("nil,nir->lr", left, white))
+    def dot(
+        self, left: Float[Array, "n 3 l"], right: Float[Array, "n 3 r"], white: Float[Array, "n 3 r"]
+    ) -> Float[Array, "l r"]:
+        """left^T (N + H F F^T H^T)^-1 right, with N^-1 right."""
+        a, b = (jnp.einsum("nic,nik->ck", self.noise, side) for side in (left, right))
+        solved = jax.scipy.linalg.cho_solve((self.spread, True), b)
+        return jnp.einsum("nil,nir->lr", left, white) - a.T @ solved
+
+    def whitened(self, columns: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
+        """N^-1 of each column."""
+        return _each(partial(self.balance.whitened, self.frame), columns)
 
     def forces(self, off: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """H (y - h(x)) for what is seen off the prediction."""
@@ -69,11 +78,6 @@ class Metric(eqx.Module):
         roots = [jnp.sum(jnp.log(jnp.abs(one))) for one in diagonals]
         force = jnp.sum(jnp.where(w > 0, 3 * jnp.log(jnp.where(w > 0, w, 1.0)), 0.0))
         return -2 * (roots[0] + roots[1]) - force + 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
-
-    def _less(self, left, right, whole: Float[Array, "l r"]) -> Float[Array, "l r"]:
-        a, b = (jnp.einsum("nic,nik->ck", self.noise, side) for side in (left, right))
-        solved = jax.scipy.linalg.cho_solve((self.spread, True), b)
-        return whole - a.T @ solved
 
 
 class Glance(eqx.Module):
@@ -146,7 +150,7 @@ def misfit(
     """Of another prediction x of the same frame."""
     model = sheet.model(theta, moment, frame.way)
     e = metric.forces(frame.y - look(model, x))[:, :, None]
-    against = metric.dot(jnp.concatenate([metric.fields, e], axis=2), e)[:, 0]
+    against = metric.dot(jnp.concatenate([metric.fields, e], axis=2), e, metric.whitened(e))[:, 0]
     tool = beyond_tool(sheet, model, theta, frame, moment, x) / tool_sd(frame)
     return Misfit(squared=against[-1], fields=against[:-1], tool=tool)
 
@@ -186,9 +190,10 @@ def _metric(
         noise=white,
         spread=jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white)),
         fields=fields,
+        white=_each(partial(balance.whitened, linear), fields),
         among=jnp.zeros((N_FIELDS, N_FIELDS)),
     )
-    return eqx.tree_at(lambda one: one.among, metric, metric.dot(fields, fields))
+    return eqx.tree_at(lambda one: one.among, metric, metric.dot(fields, fields, metric.white))
 
 
 @eqx.filter_jit
@@ -199,8 +204,8 @@ def _columns(
     directions: Float[Array, "p d"],
     frame: ClosedFrame,
     moment: Moment,
-) -> tuple[Float[Array, "n 3 k"], Float[Array, "3 k"]]:
-    """G along some directions, Q and e; and what the tool says of each."""
+) -> tuple[Float[Array, "n 3 j"], Float[Array, "3 k"]]:
+    """G along some directions, and e; and what the tool says of G, Q and e."""
     balance, linear = metric.balance, metric.frame
     x, s = linear.x, linear.s
 
@@ -217,7 +222,7 @@ def _columns(
     tool = jnp.concatenate(
         [taken, jnp.zeros((3, N_FIELDS)), beyond_tool(sheet, model, theta, frame, moment, x)[:, None]], axis=1
     )
-    return jnp.concatenate([push - seen, metric.fields, e[:, :, None]], axis=2), tool / tool_sd(frame)
+    return jnp.concatenate([push - seen, e[:, :, None]], axis=2), tool / tool_sd(frame)
 
 
 def _each(of: Callable[[Array], Array], columns: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
@@ -233,14 +238,14 @@ def _as_seen(frame: ClosedFrame, off: Float[Array, "n 3 k"]) -> Float[Array, "n 
 
 
 @eqx.filter_jit
-def _whole(metric: Metric, columns: Float[Array, "n 3 k"]) -> Float[Array, "_k _k"]:
-    """Inner products of D's columns, one a particle, and of others."""
+def _whole(metric: Metric, beyond: Float[Array, "n 3 j"]) -> Float[Array, "_k _k"]:
+    """Inner products of D's columns, one a particle, of G's, Q's and e, G and e given."""
     balance, frame = metric.balance, metric.frame
     slope, n = frame.slope, len(frame.s)
     own = balance.precision_along(frame, slope)
     shared = jnp.einsum("ni,nic->cn", slope, metric.noise)
     own = own - shared.T @ jax.scipy.linalg.cho_solve((metric.spread, True), shared)
-    white = _each(partial(balance.whitened, frame), columns)
+    columns, white = _beside(beyond, metric.fields), _beside(metric.whitened(beyond), metric.white)
     others = jnp.einsum("nic,nik->ck", metric.noise, columns)
     solved = jax.scipy.linalg.cho_solve((metric.spread, True), others)
     between = jnp.einsum("ni,nik->nk", slope, white) - shared.T @ solved
@@ -248,6 +253,11 @@ def _whole(metric: Metric, columns: Float[Array, "n 3 k"]) -> Float[Array, "_k _
     k = columns.shape[2]
     whole = jnp.zeros((n + k, n + k)).at[:n, :n].set(own).at[:n, n:].set(between)
     return whole.at[n:, :n].set(between.T).at[n:, n:].set(among)
+
+
+def _beside(beyond: Float[Array, "n 3 j"], fields: Float[Array, "n 3 q"]) -> Float[Array, "n 3 k"]:
+    """With the smooth fields' columns before the last, which is e's."""
+    return jnp.concatenate([beyond[:, :, :-1], fields, beyond[:, :, -1:]], axis=2)
 
 
 def _fields(

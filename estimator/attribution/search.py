@@ -82,10 +82,8 @@ def revised(problem: Problem, added: list[Added], used: set[int], say: Say) -> l
         if not needed:
             say(f"{one.trial.effect.name} dropped")
             last = judged(problem, refitted(problem, rest[-1].trial, plain), used, say)
-            return [
-                replace(other, trial=_with(other.trial, last), rivals=other.rivals + _in_place_of(one, other))
-                for other in rest
-            ]
+            left = rest[:k] + [_without(one, other) for other in rest[k:]]
+            return [replace(other, trial=_with(other.trial, last)) for other in left]
         again = _chosen(needed, [pair for pair in one.others if pair[0] not in others])
         rest = [replace(other, trial=_with(other.trial, again.trial)) for other in rest]
         added = [*rest[:k], again, *rest[k:]]
@@ -160,10 +158,16 @@ def _else(added: Added) -> list[Trial]:
     return [one for one in trials if one.sensible and one.log_bayes_factor > likely]
 
 
-def _in_place_of(dropped: Added, other: Added) -> list[Trial]:
-    """An effect that was dropped, where it was not told from another that stays: so neither is that from it."""
-    names = [rival.effect.name for rival in dropped.rivals]
-    return [dropped.trial] if other.trial.effect.name in names else []
+def _without(dropped: Added, later: Added) -> Added:
+    """An effect without one before it that was dropped: from which it was not told, so neither is that from it.
+
+    What it was not told from beside that one stands only if it was in question in that one's place too.
+    """
+    in_question = [trial.effect.name for trial in _else(dropped)]
+    rivals = [rival for rival in later.rivals if rival.effect.name in in_question]
+    if later.trial.effect.name in [rival.effect.name for rival in dropped.rivals]:
+        rivals.append(dropped.trial)
+    return replace(later, rivals=rivals)
 
 
 def _beside(

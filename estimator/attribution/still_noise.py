@@ -20,10 +20,12 @@ LENGTHS = np.geomspace(0.02, 0.5, 40)
 """Ranges that are tried, in extents of the sheet."""
 MOST_SMOOTH = 0.95
 """Largest share of the variance that the smooth part may be."""
-MODES = 45
-"""Most smooth fields that the smooth part is made of."""
-KEPT = 0.97
-"""Share of the smooth part's variance that they hold; the rest counts as white."""
+MODES, STEP = 45, 15
+"""Most smooth fields that the smooth part is made of; filled up with zeros to a multiple, so that most recordings are
+compiled for alike."""
+KEPT, MATTERS = 0.97, 0.5
+"""Share of the smooth part's variance that they hold, and the least variance along one, in units of the white part's;
+the rest counts as white."""
 FEWEST = 5
 """Still frames from which noise is measured."""
 USUALLY = 0.9
@@ -51,9 +53,11 @@ class StillNoise:
         squared = np.sum((rest[:, None] - rest[None]) ** 2, axis=2)
         values, vectors = np.linalg.eigh(np.exp(-0.5 * squared / self.length**2))
         values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
-        m = min(int(np.searchsorted(np.cumsum(values), KEPT * values.sum())) + 1, MODES, len(rest))
+        enough = int(np.searchsorted(np.cumsum(values), KEPT * values.sum())) + 1
+        matter = int(np.sum(values * self.smooth_sd**2 > MATTERS * self.sd**2))
+        m = min(enough, matter, MODES)
         left = 1 - values[:m].sum() / values.sum()
-        fields = np.zeros((len(rest), MODES))
+        fields = np.zeros((len(rest), -(-m // STEP) * STEP))
         fields[:, :m] = self.smooth_sd * vectors[:, :m] * np.sqrt(values[:m])
         return fields, float(np.sqrt(self.sd**2 + left * self.smooth_sd**2))
 
