@@ -185,7 +185,7 @@ def test_frames_that_are_doubted_say_less_of_the_attachments(light):
     fitted = closed.stages[-1].fitted
     with jax.enable_x64(True), one_thread():
         same, nothing = (doubted(closed.problem, fitted, excess) for excess in (1.0, 1e9))
-    np.testing.assert_array_equal(same.probability, fitted.probability)
+    np.testing.assert_allclose(same.probability, fitted.probability, rtol=1e-9)  # carried to where the fit ended
     assert fitted.attached.any() and not nothing.attached.any()
 
 
