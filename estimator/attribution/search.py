@@ -82,8 +82,8 @@ def revised(problem: Problem, added: list[Added], used: set[int], say: Say) -> l
         if not needed:
             say(f"{one.trial.effect.name} dropped")
             last = judged(problem, refitted(problem, rest[-1].trial, plain), used, say)
-            left = rest[:k] + [_without(one, other) for other in rest[k:]]
-            return [replace(other, trial=_with(other.trial, last)) for other in left]
+            rest = rest[:k] + [_without(one, other) for other in rest[k:]]
+            return [replace(other, trial=_with(other.trial, last)) for other in rest]
         again = _chosen(needed, [pair for pair in one.others if pair[0] not in others])
         rest = [replace(other, trial=_with(other.trial, again.trial)) for other in rest]
         added = [*rest[:k], again, *rest[k:]]
