@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, doubted, fit, start
 from jiggle_mj.estimator.attribution.gather import Gathered
-from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
+from jiggle_mj.estimator.attribution.held_out import Foretold, foretell, foretold
 from jiggle_mj.estimator.attribution.leftover import leftover
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.attribution.search import MOST, Added, Refused, following, revised
@@ -118,7 +118,7 @@ def _declared(problem: Problem, gathered: Gathered, used: set[int], say: Callabl
     states = np.array([one.state for one in gathered.frames])
     point = start(problem, np.zeros(problem.sheet.size), s, states, problem.frames(used))
     fitted = fit(problem, np.zeros(0, dtype=int), point, used, say=say)
-    folds = [foretell(problem, one, part) for part, one in left_out(problem, fitted, used).items()]
+    folds = foretold(problem, left_out(problem, fitted, used))
     return Stage(fitted=fitted, left=leftover(problem, fitted), folds=folds, scores=[])
 
 

@@ -35,6 +35,8 @@ standard deviations."""
 GAIN = 2.5e-4
 """Share of its cost by which normal equations must promise that a step lessens it; below, the fit has come to its end.
 What they promise is kept to within a third near there, and to weigh all frames anew costs ten times a prediction."""
+LEAST = 1e-2
+"""Precision of each s in a step of what is attached: frames may tell several only together."""
 Step = tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
 """Of the parameters and of s."""
 
@@ -244,19 +246,33 @@ def _promised(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: 
 
 
 def _steps(problem: Problem, now: Fitted, *, together: bool = True) -> list[Step]:
-    """To the s that samples find attached one by one, at the s at hand, and to those likeliest together.
+    """To the s that samples find attached one by one, at the s at hand, of what is attached, and to those likeliest.
 
     Each with the parameters that fit it best. Where any of many may carry a load, none of them is likelier attached
-    than not, and yet one must be.
+    than not, and yet one must be. And where a load is lighter than was thought, all that carry it are softer, but none
+    of them by itself.
     """
     found = problem.prior.bounded(jnp.where(now.stated.probability > 0.5, now.stated.b, 0.0))
-    steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now)]
+    steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now), _of_attached(problem, now)]
     return [*steps, _towards(problem, now, np.asarray(likeliest(now.belief)))] if together else steps
 
 
 def _at_hand(problem: Problem, now: Fitted) -> Step:
     """Of the parameters alone."""
     return _towards(problem, now, now.point.s)
+
+
+def _of_attached(problem: Problem, now: Fitted) -> Step:
+    """Of the parameters and of the s of what is attached at hand, together."""
+    point, free, sd = now.point, now.free, problem.sd(now.named)
+    A, C, gt = _of_parameters(now.square, point, free, sd)
+    held = np.flatnonzero(point.s)
+    L = now.square[np.ix_(held, held)] + LEAST * np.eye(len(held))
+    both = np.block([[L, C[held]], [C[held].T, A]])
+    gone = np.linalg.solve(both, -np.concatenate([now.square[held, -1], gt]))
+    theta, s = np.zeros(len(point.theta)), np.zeros(len(point.s))
+    theta[free], s[held] = np.clip(gone[len(held) :], -FAR * sd, FAR * sd), gone[: len(held)]
+    return theta, s
 
 
 def _towards(problem: Problem, now: Fitted, to: Float[np.ndarray, " n"]) -> Step:

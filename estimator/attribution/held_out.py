@@ -64,6 +64,11 @@ class Foretold:
         )
 
 
+def foretold(problem: Problem, fits: dict[int, Fitted]) -> list[Foretold]:
+    """Each part by the fit without it."""
+    return list(side_by_side(lambda part: foretell(problem, fits[part], part), fits).values())
+
+
 def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
     """One part that was not fitted to."""
     frames = problem.frames({part})

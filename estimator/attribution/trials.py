@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jiggle_mj.estimator.attribution.every_frame import cost_under
 from jiggle_mj.estimator.attribution.fit import Fitted, fit, moved, without
-from jiggle_mj.estimator.attribution.held_out import Foretold, foretell
+from jiggle_mj.estimator.attribution.held_out import Foretold, foretold
 from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.scores import Score, bayes_factor, occam, scores
 from jiggle_mj.estimator.effects import Effect
+from jiggle_mj.estimator.side_by_side import side_by_side
 
 LOOKED_AT = 3
 """Effects that are fitted, the likeliest by their scores."""
@@ -105,11 +106,11 @@ def judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str], 
     """With what it leaves over and how it foretells."""
     left = leftover(problem, trial.fitted)
     fits = left_out(problem, trial.fitted, used)
-    folds = [foretell(problem, one, part) for part, one in fits.items()]
+    folds = foretold(problem, fits)
     thetas = [one.point.theta[trial.fitted.named] for one in fits.values()]
     found = replace(trial, left=left, folds=folds, sds=np.maximum(trial.sds, jackknife_sd(thetas, len(trial.sds))))
-    foretold = f", foretells to {1e3 * found.missed:.2f} mm" if found.folds else ""
-    say(f"{trial.effect.name} leaves {left.gain:.1f} nat to larger errors{foretold}")
+    how_well = f", foretells to {1e3 * found.missed:.2f} mm" if found.folds else ""
+    say(f"{trial.effect.name} leaves {left.gain:.1f} nat to larger errors{how_well}")
     return found
 
 
@@ -156,7 +157,7 @@ def _stepped(problem: Problem, before: Fitted, effect: Effect, at: np.ndarray, s
 
 def left_out(problem: Problem, fitted: Fitted, used: set[int]) -> dict[int, Fitted]:
     """A fit without each part; none if there are fewer than two."""
-    return {part: without(problem, fitted, part) for part in sorted(used)} if len(used) > 1 else {}
+    return side_by_side(lambda part: without(problem, fitted, part), sorted(used) if len(used) > 1 else [])
 
 
 def jackknife_sd(thetas: list[np.ndarray], size: int) -> np.ndarray:
