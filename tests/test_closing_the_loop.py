@@ -136,23 +136,21 @@ def test_a_fit_ends_where_its_parameters_fit_best(light):
     np.testing.assert_allclose(left[ended.named] / sd, 0, atol=0.5)
 
 
-def test_what_is_attached_and_parameters_step_together_to_where_both_fit_best(light):
-    """By least squares, the priors as rows of their own; what is not attached stays so."""
+def test_all_stiffnesses_and_parameters_step_together_to_where_both_fit_best(light):
+    """By least squares over one factor and the parameters, their priors as rows of their own."""
     problem, fitted = light[0].problem, light[0].stages[0].fitted
-    point, n = fitted.point, len(fitted.point.s)
-    held, sd = np.flatnonzero(point.s), problem.sd(fitted.named)
+    point, n, sd = fitted.point, len(fitted.point.s), problem.sd(fitted.named)
     values, vectors = np.linalg.eigh(fitted.square)
     rows = (np.sqrt(np.maximum(values, 0)) * vectors).T
-    least = np.sqrt(fitting.LEAST) * np.eye(len(held), len(held) + len(sd))
-    prior = np.c_[np.zeros((len(sd), len(held))), np.diag(1 / sd)]
-    open_, off = [*held, *range(n, n + len(sd))], [rows[:, -1], np.zeros(len(held)), point.theta[fitted.free] / sd]
-    best = -np.linalg.lstsq(np.r_[rows[:, open_], least, prior], np.concatenate(off), rcond=None)[0]
-    theta, s = fitting._of_attached(problem, fitted)
-    far = np.clip(best[len(held) :] / sd, -fitting.FAR, fitting.FAR)
-    assert len(held) and np.abs(far).min() < fitting.FAR
-    np.testing.assert_allclose(s[held], best[: len(held)], rtol=1e-5, atol=1e-8)
+    prior = np.diag(np.append(np.sqrt(fitting.LEAST), 1 / sd))
+    wanted = np.r_[np.c_[rows[:, :n] @ point.s, rows[:, n:-1]], prior]
+    off = np.concatenate([rows[:, -1], [0.0], point.theta[fitted.free] / sd])
+    factor, *best = -np.linalg.lstsq(wanted, off, rcond=None)[0]
+    theta, s = fitting._all_softer(problem, fitted)
+    assert point.s.any() and factor != 0
+    np.testing.assert_allclose(s, factor * point.s, rtol=1e-5, atol=1e-9)
+    far = np.clip(best / sd, -fitting.FAR, fitting.FAR)
     np.testing.assert_allclose(theta[fitted.free] / sd, far, rtol=1e-5, atol=1e-8)
-    assert not np.delete(s, held).any()
 
 
 def test_normal_equations_are_carried_to_another_point():

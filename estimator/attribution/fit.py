@@ -36,7 +36,7 @@ GAIN = 2.5e-4
 """Share of its cost by which normal equations must promise that a step lessens it; below, the fit has come to its end.
 What they promise is kept to within a third near there, and to weigh all frames anew costs ten times a prediction."""
 LEAST = 1e-2
-"""Precision of each s in a step of what is attached: frames may tell several only together."""
+"""Precision of the logarithm of a factor of all s, which nothing tells where none is attached."""
 Step = tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
 """Of the parameters and of s."""
 
@@ -246,14 +246,14 @@ def _promised(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: 
 
 
 def _steps(problem: Problem, now: Fitted, *, together: bool = True) -> list[Step]:
-    """To the s that samples find attached one by one, at the s at hand, of what is attached, and to those likeliest.
+    """To the s that samples find attached one by one, at the s at hand, to more or less of all, and to those likeliest.
 
     Each with the parameters that fit it best. Where any of many may carry a load, none of them is likelier attached
     than not, and yet one must be. And where a load is lighter than was thought, all that carry it are softer, but none
-    of them by itself.
+    of them by itself; each softer or stiffer by as much as fits best would follow the noise.
     """
     found = problem.prior.bounded(jnp.where(now.stated.probability > 0.5, now.stated.b, 0.0))
-    steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now), _of_attached(problem, now)]
+    steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now), _all_softer(problem, now)]
     return [*steps, _towards(problem, now, np.asarray(likeliest(now.belief)))] if together else steps
 
 
@@ -262,17 +262,18 @@ def _at_hand(problem: Problem, now: Fitted) -> Step:
     return _towards(problem, now, now.point.s)
 
 
-def _of_attached(problem: Problem, now: Fitted) -> Step:
-    """Of the parameters and of the s of what is attached at hand, together."""
+def _all_softer(problem: Problem, now: Fitted) -> Step:
+    """Of the parameters and of one factor of all s at hand, together."""
     point, free, sd = now.point, now.free, problem.sd(now.named)
-    A, C, gt = _of_parameters(now.square, point, free, sd)
-    held = np.flatnonzero(point.s)
-    L = now.square[np.ix_(held, held)] + LEAST * np.eye(len(held))
-    both = np.block([[L, C[held]], [C[held].T, A]])
-    gone = np.linalg.solve(both, -np.concatenate([now.square[held, -1], gt]))
-    theta, s = np.zeros(len(point.theta)), np.zeros(len(point.s))
-    theta[free], s[held] = np.clip(gone[len(held) :], -FAR * sd, FAR * sd), gone[: len(held)]
-    return theta, s
+    n, d = len(point.s), len(free)
+    along = np.zeros((n + d + 1, d + 2))
+    along[:n, 0], along[n:, 1:] = point.s, np.eye(d + 1)
+    both, sure = along.T @ now.square @ along, np.append(LEAST, sd**-2)
+    pull = both[:-1, -1] + sure * np.append(0.0, point.theta[free])
+    factor, *gone = -np.linalg.solve(both[:-1, :-1] + np.diag(sure), pull)
+    theta = np.zeros(len(point.theta))
+    theta[free] = np.clip(gone, -FAR * sd, FAR * sd)
+    return theta, factor * point.s
 
 
 def _towards(problem: Problem, now: Fitted, to: Float[np.ndarray, " n"]) -> Step:
