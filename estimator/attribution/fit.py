@@ -246,14 +246,16 @@ def _promised(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: 
 
 
 def _steps(problem: Problem, now: Fitted, *, together: bool = True) -> list[Step]:
-    """To the s that samples find attached one by one, at the s at hand, to more or less of all, and to those likeliest.
+    """To the s that samples find attached one by one, at the s at hand, and to those likeliest together.
 
     Each with the parameters that fit it best. Where any of many may carry a load, none of them is likelier attached
-    than not, and yet one must be. And where a load is lighter than was thought, all that carry it are softer, but none
-    of them by itself; each softer or stiffer by as much as fits best would follow the noise.
+    than not, and yet one must be. Nor is any where a load is lighter than was thought: all that carry it are softer, but
+    none of them by itself. Only there all s go by one factor, as what fits best elsewhere follows the noise.
     """
     found = problem.prior.bounded(jnp.where(now.stated.probability > 0.5, now.stated.b, 0.0))
-    steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now), _all_softer(problem, now)]
+    steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now)]
+    if not now.attached.any():
+        steps.append(_all_softer(problem, now))
     return [*steps, _towards(problem, now, np.asarray(likeliest(now.belief)))] if together else steps
 
 
