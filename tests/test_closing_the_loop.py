@@ -153,6 +153,16 @@ def test_all_stiffnesses_and_parameters_step_together_to_where_both_fit_best(lig
     np.testing.assert_allclose(theta[fitted.free] / sd, far, rtol=1e-5, atol=1e-8)
 
 
+def test_all_stiffnesses_may_go_by_one_factor_where_none_is_likelier_attached(light):
+    problem, fitted = light[0].problem, light[0].stages[0].fitted
+    with jax.enable_x64(True), one_thread():
+        nothing = doubted(problem, fitted, 1e9)
+        some, none = (fitting._steps(problem, one, together=False) for one in (fitted, nothing))
+    assert fitted.attached.any() and not nothing.attached.any()
+    assert len(some) == 2 and len(none) == 3
+    assert none[-1][1].any()
+
+
 def test_normal_equations_are_carried_to_another_point():
     rng = np.random.default_rng(0)
     columns, tool, gone = rng.normal(size=(9, 6)), rng.normal(size=(3, 4)), np.append(rng.normal(size=5), 1.0)

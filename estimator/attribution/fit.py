@@ -249,8 +249,8 @@ def _steps(problem: Problem, now: Fitted, *, together: bool = True) -> list[Step
     """To the s that samples find attached one by one, at the s at hand, and to those likeliest together.
 
     Each with the parameters that fit it best. Where any of many may carry a load, none of them is likelier attached
-    than not, and yet one must be. Nor is any where a load is lighter than was thought: all that carry it are softer, but
-    none of them by itself. Only there all s go by one factor, as what fits best elsewhere follows the noise.
+    than not, and yet one must be. Nor is any where a load is lighter than was thought, as all that carry it are softer
+    but none of them by itself: there all s may go by one factor. Elsewhere what fits best so would follow the noise.
     """
     found = problem.prior.bounded(jnp.where(now.stated.probability > 0.5, now.stated.b, 0.0))
     steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now)]
