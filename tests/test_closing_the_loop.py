@@ -146,7 +146,7 @@ def test_all_stiffnesses_and_parameters_step_together_to_where_both_fit_best(lig
     wanted = np.r_[np.c_[rows[:, :n] @ point.s, rows[:, n:-1]], prior]
     off = np.concatenate([rows[:, -1], [0.0], point.theta[fitted.free] / sd])
     factor, *best = -np.linalg.lstsq(wanted, off, rcond=None)[0]
-    theta, s = fitting._all_softer(problem, fitted)
+    theta, s = fitting._by_one_factor(problem, fitted)
     assert point.s.any() and factor != 0
     np.testing.assert_allclose(s, factor * point.s, rtol=1e-5, atol=1e-9)
     far = np.clip(best / sd, -fitting.FAR, fitting.FAR)

@@ -36,7 +36,7 @@ GAIN = 2.5e-4
 """Share of its cost by which normal equations must promise that a step lessens it; below, the fit has come to its end.
 What they promise is kept to within a third near there, and to weigh all frames anew costs ten times a prediction."""
 LEAST = 1e-2
-"""Precision of the logarithm of a factor of all s, which nothing tells where none is attached."""
+"""Precision with which a factor of all s is 1, as nothing tells it where none is attached."""
 Step = tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
 """Of the parameters and of s."""
 
@@ -255,7 +255,7 @@ def _steps(problem: Problem, now: Fitted, *, together: bool = True) -> list[Step
     found = problem.prior.bounded(jnp.where(now.stated.probability > 0.5, now.stated.b, 0.0))
     steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now)]
     if not now.attached.any():
-        steps.append(_all_softer(problem, now))
+        steps.append(_by_one_factor(problem, now))
     return [*steps, _towards(problem, now, np.asarray(likeliest(now.belief)))] if together else steps
 
 
@@ -264,18 +264,11 @@ def _at_hand(problem: Problem, now: Fitted) -> Step:
     return _towards(problem, now, now.point.s)
 
 
-def _all_softer(problem: Problem, now: Fitted) -> Step:
-    """Of the parameters and of one factor of all s at hand, together."""
-    point, free, sd = now.point, now.free, problem.sd(now.named)
-    n, d = len(point.s), len(free)
-    along = np.zeros((n + d + 1, d + 2))
-    along[:n, 0], along[n:, 1:] = point.s, np.eye(d + 1)
-    both, sure = along.T @ now.square @ along, np.append(LEAST, sd**-2)
-    pull = both[:-1, -1] + sure * np.append(0.0, point.theta[free])
-    factor, *gone = -np.linalg.solve(both[:-1, :-1] + np.diag(sure), pull)
-    theta = np.zeros(len(point.theta))
-    theta[free] = np.clip(gone, -FAR * sd, FAR * sd)
-    return theta, factor * point.s
+def _by_one_factor(problem: Problem, now: Fitted) -> Step:
+    """To all s at hand times what fits best, whatever the parameters are."""
+    s, told = now.point.s, now.belief
+    factor = (s @ np.asarray(told.shift) + LEAST) / (s @ np.asarray(told.precision) @ s + LEAST)
+    return _towards(problem, now, factor * s)
 
 
 def _towards(problem: Problem, now: Fitted, to: Float[np.ndarray, " n"]) -> Step:
