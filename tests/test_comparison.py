@@ -67,7 +67,8 @@ def test_without_parts_left_out_the_likeliest_is_the_best():
     [
         ("friction", 290.0, 0.5, False),  # as likely, as good
         ("friction", 200.0, 0.5, True),  # less likely
-        ("friction", 290.0, 0.6, True),  # foretells worse
+        ("friction", 290.0, 0.6, False),
+        ("friction", 290.0, 0.65, True),  # foretells worse
         ("stretch", 100.0, 0.8, False),  # often confused: less is enough
         ("stretch", 100.0, 0.9, True),
         ("friction", 310.0, 0.8, False),  # explains more where it foretells worse

@@ -7,7 +7,7 @@ LEAD = 3.0
 """By how much an effect must lead the next to be named alone, whatever the shares [nat]."""
 FORETELLING = 0.25
 """Power of the error by which the nats that an effect explains are divided when the best is looked for."""
-AS_GOOD, CONFUSED = 0.9, 0.6
+AS_GOOD, CONFUSED = 0.8, 0.6
 """Shares of its error from which an effect counts as no worse than the best, and one that is often confused with it."""
 EXPLAINED = 0.85
 """Share of the best log Bayes factor from which an effect counts as explaining as much."""
