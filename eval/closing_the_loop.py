@@ -1,7 +1,7 @@
 """Closes the loop over a recording: files in, `discrepancy.json` and a page of pictures out.
 
-The truth, where one is given, is opened when all is decided, and only adds what was found of the attachments before and
-after.
+The truth, where one is given, is opened when all is decided and kept, and only adds what was found of the attachments
+before and after.
 """
 
 import json
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool
 from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.estimator.attribution.closing import close_the_loop
-from jiggle_mj.estimator.attribution.discrepancy import discrepancy
+from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
 from jiggle_mj.estimator.attribution.gather import gather
 from jiggle_mj.estimator.attribution.suggestion import suggest
 from jiggle_mj.estimator.blas import one_thread
@@ -73,8 +73,14 @@ def close_loop(
     gathered = gather(recording.declaration, recording.camera, recording, config=EstimatorConfig(), on_frame=on_frame)
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(gathered, library=library, say=say)
-        found = made_by() | discrepancy(closed, gathered, suggest(closed, gathered, say=say) if suggestion else None)
-    sheet = gathered.estimator.sheet
+        found = made_by() | discrepancy(closed, gathered)
+    sheet, name = gathered.estimator.sheet, recording.metadata.get("name", recording_path.stem)
+
+    def keep() -> None:
+        (directory / DISCREPANCY).write_text(json.dumps(found, indent=1) + "\n")
+        write_page(directory / PAGE, name=name, sheet=sheet, found=found)
+
+    keep()
     if truth is not None:
         true = read_truth(truth)
         if true.identity != recording.metadata.get("identity", ""):
@@ -82,9 +88,12 @@ def close_loop(
         last = gathered.frames[-1].index
         for when, fitted in (("before", closed.stages[0].fitted), ("after", closed.final)):
             found[f"detection_{when}"] = _scored(sheet, fitted.attached, true, last)
-    name = recording.metadata.get("name", recording_path.stem)
-    (directory / DISCREPANCY).write_text(json.dumps(found, indent=1) + "\n")
-    write_page(directory / PAGE, name=name, sheet=sheet, found=found)
+        keep()
+    if suggestion:
+        with jax.enable_x64(True), one_thread():
+            best = suggest(closed, gathered, say=say)
+        found["suggestion"] = None if best is None else suggested(best)
+        keep()
     return found
 
 

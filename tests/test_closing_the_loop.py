@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from functools import cache
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -15,7 +16,7 @@ from jiggle_mj.estimator.attribution import leftover as leaving
 from jiggle_mj.estimator.attribution import sheet as predicting
 from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
 from jiggle_mj.estimator.attribution.closing import close_the_loop
-from jiggle_mj.estimator.attribution.discrepancy import discrepancy
+from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
 from jiggle_mj.estimator.attribution.fit import doubted, fit, moved
 from jiggle_mj.estimator.attribution.gather import assumed, gather
 from jiggle_mj.estimator.attribution.linear import Glance
@@ -30,6 +31,7 @@ from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.estimator.environment import Weight
 from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.eval import closing_the_loop as keeping
 from jiggle_mj.eval.discrepancy_page import story, write_page
 from small_sheet import DECLARATION, GRIP_RADIUS, STIFFNESS, attached, lifts, sheet, sheet_balance, sheet_energy
 
@@ -319,6 +321,24 @@ def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
 
 
 @pytest.mark.slow
+def test_what_was_found_is_kept_before_a_pull_is_looked_for(light, tmp_path, monkeypatch):
+    closed, _, gathered = light
+    recording = SimpleNamespace(declaration=None, camera=None, metadata={"name": "light"})
+
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(keeping.Recording, "open", staticmethod(lambda *_, **__: recording))
+    monkeypatch.setattr(keeping, "gather", lambda *_, **__: gathered)
+    monkeypatch.setattr(keeping, "close_the_loop", lambda *_, **__: closed)
+    monkeypatch.setattr(keeping, "suggest", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        keeping.close_loop(tmp_path / "run.mcap", tmp_path / "closed", suggestion=True)
+    kept = json.loads((tmp_path / "closed" / keeping.DISCREPANCY).read_text())
+    assert kept["verdict"] == closed.verdict and kept["suggestion"] is None
+    assert "gravity" in (tmp_path / "closed" / keeping.PAGE).read_text()
+
+
 def test_a_pull_is_suggested_that_tells_more_than_the_first_lift_did(light):
     closed, gathered = light[0], light[2]
     with jax.enable_x64(True), one_thread():
@@ -330,7 +350,7 @@ def test_a_pull_is_suggested_that_tells_more_than_the_first_lift_did(light):
         assert told_apart(closed.problem, [fits[0], fits[0]], first) == pytest.approx(0, abs=1)
     assert np.linalg.norm(found.pull) <= max(np.linalg.norm(one.frame.way) for one in gathered.frames) + 1e-9
     assert np.min(np.linalg.norm(sheet().rest - found.grasp, axis=1)) < 1e-3
-    told = discrepancy(closed, gathered, found)
+    told = discrepancy(closed, gathered) | {"suggestion": suggested(found)}
     assert ("To tell" in " ".join(story(told))) == found.enough
 
 

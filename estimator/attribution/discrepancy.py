@@ -11,8 +11,8 @@ from jiggle_mj.estimator.attribution.suggestion import Suggestion
 from jiggle_mj.estimator.attribution.trials import Trial, stated_sd
 
 
-def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | None = None) -> dict[str, Any]:
-    """Numbers, strings and lists alone; lengths in metres, log Bayes factors in nat."""
+def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
+    """Numbers, strings and lists alone; lengths in metres, log Bayes factors in nat. No pull is suggested yet."""
     first, last = closed.stages[0], closed.stages[-1]
     noise, before = gathered.noise, localisation(closed.problem, first.fitted)
     return {
@@ -56,7 +56,7 @@ def discrepancy(closed: Closed, gathered: Gathered, suggestion: Suggestion | Non
         "frames": {"used": len(gathered.frames), "left_out": list(gathered.left_out)},
         "localisation": before,
         "localisation_after": before if closed.final is first.fitted else localisation(closed.problem, closed.final),
-        "suggestion": None if suggestion is None else _suggestion(suggestion),
+        "suggestion": None,
         "detection_before": None,
         "detection_after": None,
     }
@@ -86,7 +86,8 @@ def _baselines(closed: Closed, gathered: Gathered) -> dict[str, float | None]:
     }
 
 
-def _suggestion(found: Suggestion) -> dict[str, Any]:
+def suggested(found: Suggestion) -> dict[str, Any]:
+    """What stands under `suggestion`."""
     return {
         "grasp_m": found.grasp.tolist(),
         "pull_m": found.pull.tolist(),
