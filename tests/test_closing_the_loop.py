@@ -320,7 +320,6 @@ def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
     assert f"Added: {found['effects'][0]['name']}" in (tmp_path / "a.html").read_text()
 
 
-@pytest.mark.slow
 def test_what_was_found_is_kept_before_a_pull_is_looked_for(light, tmp_path, monkeypatch):
     closed, _, gathered = light
     recording = SimpleNamespace(declaration=None, camera=None, metadata={"name": "light"})
@@ -339,6 +338,7 @@ def test_what_was_found_is_kept_before_a_pull_is_looked_for(light, tmp_path, mon
     assert "gravity" in (tmp_path / "closed" / keeping.PAGE).read_text()
 
 
+@pytest.mark.slow
 def test_a_pull_is_suggested_that_tells_more_than_the_first_lift_did(light):
     closed, gathered = light[0], light[2]
     with jax.enable_x64(True), one_thread():
