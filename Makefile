@@ -5,7 +5,6 @@ BIN := $(abspath $(VENV))/bin
 export MUJOCO_GL ?= egl
 
 SET_UP := $(VENV)/.set-up
-TYPES := build/types
 
 help:
 	@echo "make demo    set up, then find where a tissue is attached; the report is out/demo/report.html"
@@ -37,12 +36,8 @@ lint: $(SET_UP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# Pyright cannot follow the folders' mapping onto jiggle_mj.*, so it reads the tree as the wheel lays it out.
 types: $(SET_UP)
-	rm -rf $(TYPES)
-	$(BIN)/python -c "import setuptools; setuptools.setup()" --quiet build_py --build-lib $(TYPES)
-	cp -r tests tools typings tools/pyrightconfig.json $(TYPES)
-	$(BIN)/pyright --pythonpath $(BIN)/python --project $(TYPES)
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 format: $(SET_UP)
 	$(BIN)/ruff check --fix .

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from jiggle_mj.estimator.surrogate import Membrane
+from .physics.surrogate import Membrane
 
 FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
 Judging = Literal["grasps", "frames", "end"]

@@ -12,23 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from jiggle_mj.estimator import stating
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.belief import BoundaryBelief
-from jiggle_mj.estimator.blas import one_thread
-from jiggle_mj.estimator.config import EstimatorConfig
-from jiggle_mj.estimator.environment import Grip
-from jiggle_mj.estimator.filters.build import build_filter
-from jiggle_mj.estimator.filters.evidence import Filter, Stated
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter
-from jiggle_mj.estimator.fusion import fused, pull
-from jiggle_mj.estimator.grip import GripHold
-from jiggle_mj.estimator.identification import identify
-from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.outlook import Outlook
-from jiggle_mj.estimator.perception import Believed, Disparity, Sight, TissueMask, Track
-from jiggle_mj.estimator.perception.mesh_field import MeshField
-from jiggle_mj.estimator.topology import Change, after, meant_by, region_of
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
@@ -37,6 +20,24 @@ from jiggle_mj.material import Material, material
 from jiggle_mj.mesh_checks import check_unfolded
 from jiggle_mj.observation import Cut, Declaration, Observation, Suture, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
+
+from .belief import summaries as stating
+from .belief.attachment_belief import AttachmentBelief
+from .belief.boundary_belief import BoundaryBelief
+from .belief.topology import Change, after, meant_by, region_of
+from .blas import one_thread
+from .config import EstimatorConfig
+from .filters.build import build_filter
+from .filters.evidence import Filter, Stated
+from .filters.implicit import ImplicitFilter
+from .fusion import fused, pull
+from .grip import GripHold
+from .identification import identify
+from .perception import Believed, Disparity, Sight, TissueMask, Track
+from .perception.mesh_field import MeshField
+from .physics.environment import Grip
+from .physics.mesh import SheetMesh
+from .planning.pull_predictor import Outlook
 
 SEEN = 3e-4
 """Standard deviation of a seen coordinate before the first frame has said how well it is seen [m]."""

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.filters.evidence import Evidence, Pull
-from jiggle_mj.estimator.grip import GripHold
-from jiggle_mj.estimator.perception.mesh_field import MeshField
-from jiggle_mj.estimator.perception.track import Track
 
 from jiggle_mj.observation import ToolState
+
+from .filters.evidence import Evidence, Pull
+from .grip import GripHold
+from .perception.mesh_field import MeshField
+from .perception.track import Track
 
 
 @dataclass(frozen=True, kw_only=True)

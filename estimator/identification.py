@@ -18,11 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.filters.evidence import Evidence, Stated
-from jiggle_mj.estimator.filters.force_balance import ForceBalance
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter
-from jiggle_mj.estimator.ratios import ratios, scaled
+
+from .belief.attachment_belief import AttachmentBelief
+from .filters.evidence import Evidence, Stated
+from .filters.force_balance import ForceBalance
+from .filters.implicit import ImplicitFilter
+from .physics.ratios import ratios, scaled
 
 PASSES = 12
 PRIOR_SD = 2.0

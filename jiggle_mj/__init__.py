@@ -9,54 +9,55 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jiggle_mj.camera import CameraCalibration as CameraCalibration
-    from jiggle_mj.camera import StereoCamera as StereoCamera
-    from jiggle_mj.errors import ActionError as ActionError
-    from jiggle_mj.errors import ClusterError as ClusterError
-    from jiggle_mj.errors import JiggleError as JiggleError
-    from jiggle_mj.errors import MeshError as MeshError
-    from jiggle_mj.errors import OptionError as OptionError
-    from jiggle_mj.errors import OutputError as OutputError
-    from jiggle_mj.errors import PerceptionError as PerceptionError
-    from jiggle_mj.errors import RecordingError as RecordingError
-    from jiggle_mj.errors import RenderError as RenderError
-    from jiggle_mj.errors import SceneError as SceneError
-    from jiggle_mj.errors import SimulationError as SimulationError
-    from jiggle_mj.estimate import Belief as Belief
-    from jiggle_mj.estimate import Detection as Detection
-    from jiggle_mj.estimate import Estimate as Estimate
-    from jiggle_mj.estimate import Sheet as Sheet
     from jiggle_mj.estimator import Estimator as Estimator
     from jiggle_mj.estimator import EstimatorConfig as EstimatorConfig
-    from jiggle_mj.eval.closing_the_loop import close_loop as close_loop
-    from jiggle_mj.eval.experiment import run_estimator as run_estimator
-    from jiggle_mj.eval.experiment import run_scene as run_scene
-    from jiggle_mj.eval.score import score as score
-    from jiggle_mj.importing import import_folder as import_folder
-    from jiggle_mj.material import Material as Material
-    from jiggle_mj.observation import Action as Action
-    from jiggle_mj.observation import Cut as Cut
-    from jiggle_mj.observation import Declaration as Declaration
-    from jiggle_mj.observation import DeclaredMesh as DeclaredMesh
-    from jiggle_mj.observation import Grasp as Grasp
-    from jiggle_mj.observation import MeasuredPoints as MeasuredPoints
-    from jiggle_mj.observation import Move as Move
-    from jiggle_mj.observation import Observation as Observation
-    from jiggle_mj.observation import Release as Release
-    from jiggle_mj.observation import StereoPair as StereoPair
-    from jiggle_mj.observation import Suture as Suture
-    from jiggle_mj.observation import ToolState as ToolState
-    from jiggle_mj.observation import Wait as Wait
-    from jiggle_mj.recording import Recording as Recording
-    from jiggle_mj.recording import RecordingWriter as RecordingWriter
-    from jiggle_mj.recording_series import RecordingSeries as RecordingSeries
-    from jiggle_mj.recording_series import record_series as record_series
+    from jiggle_mj.eval.metrics.score import score as score
+    from jiggle_mj.eval.runs.closing_the_loop import close_loop as close_loop
+    from jiggle_mj.eval.runs.experiment import run_estimator as run_estimator
+    from jiggle_mj.eval.runs.experiment import run_scene as run_scene
     from jiggle_mj.scenes import Reference as Reference
     from jiggle_mj.scenes import Scene as Scene
     from jiggle_mj.scenes import load_scene as load_scene
     from jiggle_mj.scenes import programme as programme
     from jiggle_mj.scenes import shipped_scenes as shipped_scenes
-    from jiggle_mj.worker_processes import WorkerProcesses as WorkerProcesses
+
+    from .camera import CameraCalibration as CameraCalibration
+    from .camera import StereoCamera as StereoCamera
+    from .errors import ActionError as ActionError
+    from .errors import ClusterError as ClusterError
+    from .errors import JiggleError as JiggleError
+    from .errors import MeshError as MeshError
+    from .errors import OptionError as OptionError
+    from .errors import OutputError as OutputError
+    from .errors import PerceptionError as PerceptionError
+    from .errors import RecordingError as RecordingError
+    from .errors import RenderError as RenderError
+    from .errors import SceneError as SceneError
+    from .errors import SimulationError as SimulationError
+    from .estimate import Belief as Belief
+    from .estimate import Detection as Detection
+    from .estimate import Estimate as Estimate
+    from .estimate import Sheet as Sheet
+    from .importing.folder import import_folder as import_folder
+    from .material import Material as Material
+    from .observation import Action as Action
+    from .observation import Cut as Cut
+    from .observation import Declaration as Declaration
+    from .observation import DeclaredMesh as DeclaredMesh
+    from .observation import Grasp as Grasp
+    from .observation import MeasuredPoints as MeasuredPoints
+    from .observation import Move as Move
+    from .observation import Observation as Observation
+    from .observation import Release as Release
+    from .observation import StereoPair as StereoPair
+    from .observation import Suture as Suture
+    from .observation import ToolState as ToolState
+    from .observation import Wait as Wait
+    from .recording.reader import Recording as Recording
+    from .recording.reader import RecordingWriter as RecordingWriter
+    from .series import RecordingSeries as RecordingSeries
+    from .series import record_series as record_series
+    from .worker_processes import WorkerProcesses as WorkerProcesses
 
     __version__: str
 
@@ -129,10 +130,10 @@ _NAMES_OF = {
     ),
     "estimate": ("Belief", "Detection", "Estimate", "Sheet"),
     "estimator": ("Estimator", "EstimatorConfig"),
-    "eval.closing_the_loop": ("close_loop",),
-    "eval.experiment": ("run_estimator", "run_scene"),
-    "eval.score": ("score",),
-    "importing": ("import_folder",),
+    "eval.runs.closing_the_loop": ("close_loop",),
+    "eval.runs.experiment": ("run_estimator", "run_scene"),
+    "eval.metrics.score": ("score",),
+    "importing.folder": ("import_folder",),
     "material": ("Material",),
     "observation": (
         "Action",
@@ -149,8 +150,8 @@ _NAMES_OF = {
         "ToolState",
         "Wait",
     ),
-    "recording": ("Recording", "RecordingWriter"),
-    "recording_series": ("RecordingSeries", "record_series"),
+    "recording.reader": ("Recording", "RecordingWriter"),
+    "series": ("RecordingSeries", "record_series"),
     "scenes": ("Reference", "Scene", "load_scene", "programme", "shipped_scenes"),
     "worker_processes": ("WorkerProcesses",),
 }

@@ -1,5 +1,5 @@
 """`python -m jiggle_mj` is `jiggle-mj`."""
 
-from jiggle_mj.cli import main
+from .cli import main
 
 main()

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jiggle_mj.errors import RecordingError
+from .errors import RecordingError
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns an OpenGL camera frame (y up, looking along -z; MuJoCo's) into an optical one, and back: it is its inverse."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 
-from jiggle_mj.errors import ClusterError, OptionError
+from .errors import ClusterError, OptionError
 
 URL = r"dask://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):(\d{1,5})"
 PATIENCE = "10s"

@@ -11,14 +11,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jiggle_mj.errors import ActionError, OutputError, PerceptionError
-from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
-from jiggle_mj.estimate_recording import EstimateWriter
-from jiggle_mj.mcap_files import truth_path
-from jiggle_mj.observation import Action, Observation
-from jiggle_mj.recording import Recording, RecordingWriter
-from jiggle_mj.recording_declaration import identity
-from jiggle_mj.truth_recording import TruthWriter
+from .errors import ActionError, OutputError, PerceptionError
+from .estimate import Belief, Detection, Estimate, Sheet
+from .observation import Action, Observation
+from .recording.declaration import identity
+from .recording.estimate import EstimateWriter
+from .recording.mcap_files import truth_path
+from .recording.reader import Recording, RecordingWriter
+from .recording.truth import TruthWriter
 
 if TYPE_CHECKING:
     from jiggle_mj.estimator import Estimator, EstimatorConfig

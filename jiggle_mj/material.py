@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jiggle_mj.observation import Declaration
+from .observation import Declaration
 
 DOUBTFUL = np.log(2) / 2
 """Standard error of a logarithm from which on nothing is stated: two of them are a factor of two either way."""

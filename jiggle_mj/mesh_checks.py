@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, Shaped
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jiggle_mj.errors import MeshError
+from .errors import MeshError
 
 MINIMUM_RELATIVE_AREA = 1e-6
 """Twice a triangle's area over its longest edge squared, below which it has no usable normal in float32."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jiggle_mj.errors import RecordingError
+from .errors import RecordingError
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 """The quaternion wxyz of no rotation."""

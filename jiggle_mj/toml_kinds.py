@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jiggle_mj.errors import RecordingError
+from .errors import RecordingError
 
 REQUIRED = object()
 

@@ -18,7 +18,7 @@ from queue import LifoQueue
 from types import TracebackType
 from typing import Any, TypeVar
 
-from jiggle_mj.errors import OptionError
+from .errors import OptionError
 
 T = TypeVar("T")
 SPAWN = multiprocessing.get_context("spawn")

@@ -6,12 +6,12 @@ with Reference(scene, seed=0, sensing="stereo") as reference:
         observation = reference.step(action)
 """
 
-from jiggle_mj.scenes import opengl as opengl  # before anything that imports mujoco
-from jiggle_mj.scenes.disturbances import DISTURBANCES, disturbed
-from jiggle_mj.scenes.programme import programme
-from jiggle_mj.scenes.reference import Reference
-from jiggle_mj.scenes.scene import Scene
-from jiggle_mj.scenes.scene_file import load_scene, scene_table, shipped_scenes
+from . import opengl as opengl  # before anything that imports mujoco
+from .disturbances.registry import DISTURBANCES, disturbed
+from .reference import Reference
+from .scene.programme import programme
+from .scene.scene import Scene
+from .scene_file import load_scene, scene_table, shipped_scenes
 
 __all__ = [
     "DISTURBANCES",

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from jiggle_mj.scenes.disturbances import MATERIAL
-from jiggle_mj.scenes.scene import Bed, Scene, Tissue
-from jiggle_mj.scenes.simulation import Simulation
-from jiggle_mj.scenes.world_disturbances import Gravity
+
+from .disturbances.registry import MATERIAL
+from .disturbances.world import Gravity
+from .scene.scene import Bed, Scene, Tissue
+from .tissue.simulation import Simulation
 
 STRAIN = 2e-3
 """Of the membrane tests, both ways."""

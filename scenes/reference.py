@@ -12,18 +12,19 @@ from typing import Self
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.scenes.disturbances import described
-from jiggle_mj.scenes.observer import SENSING, Observer, Sensing
-from jiggle_mj.scenes.procedure import carry_out
-from jiggle_mj.scenes.scene import Scene
-from jiggle_mj.scenes.scene_file import scene_table
-from jiggle_mj.scenes.simulation import MAX_STEPS, Simulation
-from jiggle_mj.scenes.tissue import TIMESTEP
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import ActionError, SceneError
 from jiggle_mj.observation import Action, Cut, Declaration, Grasp, Move, Observation, Release, Suture, ToolState, Wait
 from jiggle_mj.truth import Truth, TruthFrame
+
+from .disturbances.registry import described
+from .scene.scene import Scene
+from .scene_file import scene_table
+from .sensing.observer import SENSING, Observer, Sensing
+from .tissue.model import TIMESTEP
+from .tissue.procedure import carry_out
+from .tissue.simulation import MAX_STEPS, Simulation
 
 CHANCE = (1,)
 """Sets the failures of cuts and sutures apart from the noise of sensing."""

@@ -10,10 +10,12 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from jiggle_mj.scenes.attachments import SHAPES, Attachment
-from jiggle_mj.scenes.disturbance import Disturbance
-from jiggle_mj.scenes.disturbances import name_of, named
-from jiggle_mj.scenes.scene import (
+from jiggle_mj.errors import SceneError
+
+from .disturbances.registry import named
+from .scene.attachments import SHAPES, Attachment
+from .scene.disturbance import Disturbance
+from .scene.scene import (
     Bed,
     Camera,
     Declared,
@@ -27,9 +29,7 @@ from jiggle_mj.scenes.scene import (
     Tissue,
     Tweezer,
 )
-from jiggle_mj.scenes.section import Section, checked
-
-from jiggle_mj.errors import SceneError
+from .scene.section import Section, checked
 
 SECTIONS: dict[str, type[Section]] = {
     cls.section: cls
@@ -128,7 +128,7 @@ def scene_table(scene: Scene) -> dict[str, Any]:
     table: dict[str, Any] = {"seed": scene.seed, "secret": scene.secret}
     shape_names = {cls: shape for shape, cls in SHAPES.items()}
     table["attachments"] = [{"shape": shape_names[type(shape)], **_plain(shape)} for shape in scene.attachments]
-    table["disturbances"] = [{"name": name_of(one), **_plain(one)} for one in scene.disturbances]
+    table["disturbances"] = [{"name": one.kind(), **_plain(one)} for one in scene.disturbances]
     return table | {key: _plain(getattr(scene, key)) for key in SECTIONS}
 
 

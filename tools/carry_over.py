@@ -13,12 +13,12 @@ from typing import Any
 
 import jax
 import numpy as np
+
 from jiggle_mj.estimator.attribution.gather import gather
 from jiggle_mj.estimator.attribution.held_out import from_rest, off, rms
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects import LIBRARY
-
-from jiggle_mj.recording import Recording
+from jiggle_mj.recording.reader import Recording
 
 
 def main() -> None:

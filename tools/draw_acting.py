@@ -9,11 +9,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jiggle_mj.eval.carrying import carry
 
-from jiggle_mj.estimate_recording import read_estimate
-from jiggle_mj.recording import Recording
-from jiggle_mj.truth_recording import read_truth
+from jiggle_mj.eval.metrics.truth_transfer import carry
+from jiggle_mj.recording.estimate import read_estimate
+from jiggle_mj.recording.reader import Recording
+from jiggle_mj.recording.truth import read_truth
 
 OUT = Path("docs/images/acting.webp")
 SHOWN = slice(60, 480), slice(100, 580)

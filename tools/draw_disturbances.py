@@ -10,6 +10,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 
 import cv2
 import numpy as np
+
 from jiggle_mj.scenes import Reference, disturbed, load_scene, programme
 
 SHOWN = ("", "gravity=0", "grasp_slip", "specular", "haze", "dark_patches", "tool_occlusion")

@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, Timed
-from jiggle_mj.estimator.attribution.held_out import rms
+
+from .closed_frames import ClosedFrame, Timed
+from .held_out import rms
 
 
 def unmoved(frames: list[Timed], part: int) -> float:

@@ -8,7 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from jiggle_mj.estimator.effects.sheet_model import Moment
+
+from ..effects.sheet_model import Moment
 
 USUAL_GAP = 0.25
 """Between frames, where the jaws have just closed [s]."""

@@ -10,15 +10,16 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from jiggle_mj.estimator.attribution.fit import STIFFEST, Fitted, doubted, fit, start
-from jiggle_mj.estimator.attribution.gather import Gathered
-from jiggle_mj.estimator.attribution.held_out import Foretold, foretell, foretold
-from jiggle_mj.estimator.attribution.leftover import leftover
-from jiggle_mj.estimator.attribution.problem import Problem
-from jiggle_mj.estimator.attribution.search import MOST, Added, Refused, following, revised
-from jiggle_mj.estimator.attribution.trials import REMAINDER, Stage, Trial, left_out
-from jiggle_mj.estimator.attribution.users_effects import check_effects
-from jiggle_mj.estimator.effects import LIBRARY, Effect
+
+from ..effects import LIBRARY, Effect
+from .fit import STIFFEST, Fitted, doubted, fit, start
+from .gather import Gathered
+from .held_out import Foretold, foretell, foretold
+from .leftover import leftover
+from .problem import Problem
+from .search import MOST, Added, Refused, following, revised
+from .trials import REMAINDER, Stage, Trial, left_out
+from .users_effects import check_effects
 
 EXCESS = 5.0
 """How many times the stated variance parts left out may be missed before something is said to be left over."""

@@ -1,7 +1,7 @@
 """Effects against each other, and against having none: by what they explain, and by what they foretell."""
 
-from jiggle_mj.estimator.attribution.held_out import Foretold
-from jiggle_mj.estimator.attribution.trials import ABSURD, ENTER, REMAINDER, Stage, Trial
+from .held_out import Foretold
+from .trials import ABSURD, ENTER, REMAINDER, Stage, Trial
 
 LEAD = 3.0
 """By how much an effect must lead the next to be named alone, whatever the shares [nat]."""

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
-from jiggle_mj.estimator.attribution.closing import Closed
-from jiggle_mj.estimator.attribution.gather import Gathered
-from jiggle_mj.estimator.attribution.held_out import Foretold
-from jiggle_mj.estimator.attribution.localisation import localisation
-from jiggle_mj.estimator.attribution.suggestion import Suggestion
-from jiggle_mj.estimator.attribution.trials import Trial, stated_sd
+from .baselines import in_proportion, unmoved
+from .closing import Closed
+from .gather import Gathered
+from .held_out import Foretold
+from .localisation import localisation
+from .suggestion import Suggestion
+from .trials import Trial, stated_sd
 
 
 def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:

@@ -5,12 +5,13 @@ from collections.abc import Callable, Iterable
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, Metric, Misfit, glance, misfit, weigh
-from jiggle_mj.estimator.attribution.normal_equations import less_offset
-from jiggle_mj.estimator.attribution.problem import Point, Problem
-from jiggle_mj.estimator.effects.sheet_model import Moment
-from jiggle_mj.estimator.side_by_side import T, side_by_side
+
+from ..effects.sheet_model import Moment
+from ..parallel_map import T, side_by_side
+from .closed_frames import ClosedFrame
+from .linear import N_FIELDS, Glance, Metric, Misfit, glance, misfit, weigh
+from .normal_equations import less_offset
+from .problem import Point, Problem
 
 DIRECTIONS = 22
 """Parameters that are fitted together, in most fits at most."""

@@ -11,14 +11,15 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.attribution.every_frame import cost_under, directions, linearised, weighed
-from jiggle_mj.estimator.attribution.linear import Glance, Metric
-from jiggle_mj.estimator.attribution.normal_equations import reduced
-from jiggle_mj.estimator.attribution.problem import Point, Problem
-from jiggle_mj.estimator.attribution.sheet import predict_all
-from jiggle_mj.estimator.filters.evidence import Stated
-from jiggle_mj.estimator.filters.implicit import likeliest, reconsidered
+
+from ..belief.attachment_belief import AttachmentBelief
+from ..filters.evidence import Stated
+from ..filters.implicit import likeliest, reconsidered
+from .every_frame import cost_under, directions, linearised, weighed
+from .linear import Glance, Metric
+from .normal_equations import reduced
+from .problem import Point, Problem
+from .sheet import predict_all
 
 ODDS = 2.2
 """What an attachment costs: the logarithm of nine to one [nat]."""

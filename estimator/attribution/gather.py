@@ -7,16 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, Timed
-from jiggle_mj.estimator.attribution.held_shape import another_shape
-from jiggle_mj.estimator.attribution.still_noise import StillNoise, measure
-from jiggle_mj.estimator.config import EstimatorConfig
-from jiggle_mj.estimator.estimator import Estimator
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Detection, Estimate
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, ToolReport
+
+from ..config import EstimatorConfig
+from ..estimator import Estimator
+from .closed_frames import ClosedFrame, Timed
+from .held_shape import another_shape
+from .still_noise import StillNoise, measure
 
 ASSUMED_SD, ASSUMED_LENGTH = 2e-4, 1.2e-2
 """White and smooth part of what is seen, each, and the range, where neither still frames nor the recording say [m]."""

@@ -7,14 +7,15 @@ from functools import cached_property
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.every_frame import weighed
-from jiggle_mj.estimator.attribution.fit import Fitted
-from jiggle_mj.estimator.attribution.linear import Metric
-from jiggle_mj.estimator.attribution.problem import Point, Problem
-from jiggle_mj.estimator.attribution.sheet import predict_all
-from jiggle_mj.estimator.side_by_side import side_by_side
 from scipy.stats import norm
+
+from ..parallel_map import side_by_side
+from .closed_frames import ClosedFrame
+from .every_frame import weighed
+from .fit import Fitted
+from .linear import Metric
+from .problem import Point, Problem
+from .sheet import predict_all
 
 ROUNDS = 2
 """Passes over a grasp, so that its frames know the states of those before."""

@@ -7,8 +7,9 @@ import warnings
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.closed_frames import Timed
 from scipy.spatial.transform import Rotation
+
+from .closed_frames import Timed
 
 FEWEST = 4
 """Held particles that are seen, from which on their shape says something."""

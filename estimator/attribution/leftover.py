@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
-from jiggle_mj.estimator.attribution.every_frame import cost, missed, weighed
-from jiggle_mj.estimator.attribution.fit import Fitted
-from jiggle_mj.estimator.attribution.linear import N_FIELDS, Metric
-from jiggle_mj.estimator.attribution.normal_equations import less_offset
-from jiggle_mj.estimator.attribution.problem import Problem
+
+from .every_frame import cost, missed, weighed
+from .fit import Fitted
+from .linear import N_FIELDS, Metric
+from .normal_equations import less_offset
+from .problem import Problem
 
 RATIO = 4.0
 VARIANCES = (1.0, RATIO, RATIO**2, RATIO**3)

@@ -17,13 +17,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.sheet import Sheet, beyond_tool, look, mean_of_held
-from jiggle_mj.estimator.effects.mechanical import cosines, flat
-from jiggle_mj.estimator.effects.sheet_model import Moment
-from jiggle_mj.estimator.filters.evidence import Evidence
-from jiggle_mj.estimator.filters.force_balance import ForceBalance, Frame
-from jiggle_mj.estimator.membrane import TriangleMembrane
+
+from ..effects.mechanical import cosines, flat
+from ..effects.sheet_model import Moment
+from ..filters.evidence import Evidence
+from ..filters.force_balance import ForceBalance, Frame
+from ..physics.membrane import TriangleMembrane
+from .closed_frames import ClosedFrame
+from .sheet import Sheet, beyond_tool, look, mean_of_held
 
 WAVES = 4
 """Cosines along each side of the sheet in the smooth force fields."""

@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.fit import Fitted
-from jiggle_mj.estimator.attribution.problem import Problem
 from scipy.stats import spearmanr
+
+from .fit import Fitted
+from .problem import Problem
 
 
 def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame
-from jiggle_mj.estimator.attribution.linear import N_FIELDS, Glance, grasp_sd, tool_sd
-from jiggle_mj.estimator.attribution.problem import Problem
+
+from .closed_frames import ClosedFrame
+from .linear import N_FIELDS, Glance, grasp_sd, tool_sd
+from .problem import Problem
 
 FIELDS = slice(-1 - N_FIELDS, -1)
 """Where the smooth force fields are in a frame's normal equations."""

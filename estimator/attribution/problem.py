@@ -6,15 +6,16 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.attribution.closed_frames import History
-from jiggle_mj.estimator.attribution.gather import Gathered
-from jiggle_mj.estimator.attribution.sheet import Sheet
-from jiggle_mj.estimator.effects.effect import Effect
-from jiggle_mj.estimator.effects.sheet_model import centred, undisturbed
-from jiggle_mj.estimator.filters.build import force_balance
-from jiggle_mj.estimator.filters.implicit import prior_belief
-from jiggle_mj.estimator.mesh import SheetMesh
+
+from ..belief.attachment_belief import AttachmentBelief
+from ..effects.effect import Effect
+from ..effects.sheet_model import centred, undisturbed
+from ..filters.build import force_balance
+from ..filters.implicit import prior_belief
+from ..physics.mesh import SheetMesh
+from .closed_frames import History
+from .gather import Gathered
+from .sheet import Sheet
 
 OWN = {
     "stretch": (0.05,),

@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.attribution.every_frame import cost_under, directions, linearised
-from jiggle_mj.estimator.attribution.fit import Fitted, fit, gains_over, moved
-from jiggle_mj.estimator.attribution.normal_equations import reduced, without_stiffnesses
-from jiggle_mj.estimator.attribution.problem import Point, Problem
-from jiggle_mj.estimator.effects.effect import Effect
 from scipy.stats import chi2
+
+from ..effects.effect import Effect
+from .every_frame import cost_under, directions, linearised
+from .fit import Fitted, fit, gains_over, moved
+from .normal_equations import reduced, without_stiffnesses
+from .problem import Point, Problem
 
 STEPS = 2
 """Of a fit from an effect's natural size."""

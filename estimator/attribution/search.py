@@ -10,20 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jiggle_mj.estimator.attribution.comparison import against, behind, best, not_told_from, outdone
-from jiggle_mj.estimator.attribution.fit import Fitted, fit, moved
-from jiggle_mj.estimator.attribution.problem import Problem
-from jiggle_mj.estimator.attribution.scores import bayes_factor
-from jiggle_mj.estimator.attribution.trials import (
-    COMPARED,
-    ENTER,
-    REMAINDER,
-    Stage,
-    Trial,
-    fitted_trials,
-    judged,
-    refitted,
-)
+
+from .comparison import against, behind, best, not_told_from, outdone
+from .fit import Fitted, fit, moved
+from .problem import Problem
+from .scores import bayes_factor
+from .trials import COMPARED, ENTER, REMAINDER, Stage, Trial, fitted_trials, judged, refitted
 
 MOST = 3
 """Effects that are added at most."""

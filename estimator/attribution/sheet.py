@@ -4,14 +4,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, History
-from jiggle_mj.estimator.effects.effect import Effect
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, View, tangents
-from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.filters.evidence import Evidence
-from jiggle_mj.estimator.filters.force_balance import ForceBalance
-from jiggle_mj.estimator.membrane import TriangleMembrane
-from jiggle_mj.estimator.side_by_side import side_by_side
+
+from ..effects.effect import Effect
+from ..effects.sheet_model import Moment, SheetModel, View, tangents
+from ..filters.evidence import Evidence
+from ..filters.force_balance import ForceBalance
+from ..parallel_map import side_by_side
+from ..physics.energy import SheetEnergy
+from ..physics.membrane import TriangleMembrane
+from .closed_frames import ClosedFrame, History
 
 GRIPPED = 1e6
 """Precision with which the grip carries what it holds while a state is predicted [1/m^2]."""

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from jiggle_mj.estimator.perception.point_tracker import usual
+
+from ..perception.point_tracker import usual
 
 PAIRS = 20_000
 """Pairs of points whose covariance is looked at."""

@@ -14,16 +14,17 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.attribution.closed_frames import USUAL_GAP, ClosedFrame, History, Timed
-from jiggle_mj.estimator.attribution.closing import Closed
-from jiggle_mj.estimator.attribution.every_frame import cost_under, weighed
-from jiggle_mj.estimator.attribution.fit import Fitted
-from jiggle_mj.estimator.attribution.gather import Gathered
-from jiggle_mj.estimator.attribution.held_out import from_rest
-from jiggle_mj.estimator.attribution.problem import Point, Problem
-from jiggle_mj.estimator.attribution.sheet import look
-from jiggle_mj.estimator.mesh import far_apart
-from jiggle_mj.estimator.policies.information import PLACES, SLANTED, UP
+
+from ..physics.mesh import far_apart
+from ..planning.information_policy import PLACES, SLANTED, UP
+from .closed_frames import USUAL_GAP, ClosedFrame, History, Timed
+from .closing import Closed
+from .every_frame import cost_under, weighed
+from .fit import Fitted
+from .gather import Gathered
+from .held_out import from_rest
+from .problem import Point, Problem
+from .sheet import look
 
 BEST = 3
 """Places, best when lifted from, from which slanted pulls are tried."""

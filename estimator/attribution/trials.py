@@ -4,14 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jiggle_mj.estimator.attribution.every_frame import cost_under
-from jiggle_mj.estimator.attribution.fit import Fitted, fit, moved, without
-from jiggle_mj.estimator.attribution.held_out import Foretold, foretold
-from jiggle_mj.estimator.attribution.leftover import Leftover, leftover
-from jiggle_mj.estimator.attribution.problem import Point, Problem
-from jiggle_mj.estimator.attribution.scores import Score, bayes_factor, occam, scores
-from jiggle_mj.estimator.effects import Effect
-from jiggle_mj.estimator.side_by_side import side_by_side
+
+from ..effects import Effect
+from ..parallel_map import side_by_side
+from .every_frame import cost_under
+from .fit import Fitted, fit, moved, without
+from .held_out import Foretold, foretold
+from .leftover import Leftover, leftover
+from .problem import Point, Problem
+from .scores import Score, bayes_factor, occam, scores
 
 LOOKED_AT = 3
 """Effects that are fitted, the likeliest by their scores."""

@@ -3,11 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jiggle_mj.estimator.attribution.problem import Problem
-from jiggle_mj.estimator.attribution.sheet import look
-from jiggle_mj.estimator.effects import LIBRARY
-from jiggle_mj.estimator.effects.effect import Effect
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel
+
+from ..effects import LIBRARY
+from ..effects.effect import Effect
+from ..effects.sheet_model import Moment, SheetModel
+from .problem import Problem
+from .sheet import look
 
 
 def check_effects(problem: Problem) -> None:

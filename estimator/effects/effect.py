@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel
+
+from .sheet_model import Moment, SheetModel
 
 Acts = Callable[[SheetModel, Float[Array, " p"], Moment], SheetModel]
 """The model of one frame with the effect in it, for parameters and what may be known of the frame; differentiable."""

@@ -4,13 +4,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.bending import IsometricBending
-from jiggle_mj.estimator.effects.effect import Effect
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, across, extent
-from jiggle_mj.estimator.effects.terms import Film, Load
-from jiggle_mj.estimator.environment import Bed, Weight
-from jiggle_mj.estimator.hanging import Tension
-from jiggle_mj.estimator.membrane import TriangleMembrane, plane_stress
+
+from ..physics.bending import IsometricBending
+from ..physics.environment import Bed, Weight
+from ..physics.hanging import Tension
+from ..physics.membrane import TriangleMembrane, plane_stress
+from .effect import Effect
+from .sheet_model import Moment, SheetModel, across, extent
+from .terms import Film, Load
 
 STANDARD_GRAVITY = 9.80665
 """[m/s^2]."""

@@ -3,10 +3,11 @@
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.effects.effect import Effect
-from jiggle_mj.estimator.effects.followed import Followed
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, across, extent
-from jiggle_mj.estimator.membrane import TriangleMembrane
+
+from ..physics.membrane import TriangleMembrane
+from .effect import Effect
+from .sheet_model import Moment, SheetModel, across, extent
+from .surface_points import Followed
 
 SMALL_ANGLE = 1e-3
 """[rad]."""

@@ -9,16 +9,17 @@ from typing import TypeVar
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.block_tridiagonal import Layout
-from jiggle_mj.estimator.effects.followed import Followed
-from jiggle_mj.estimator.effects.terms import Film, Load, Rub
-from jiggle_mj.estimator.energy import SheetEnergy, Term
-from jiggle_mj.estimator.environment import Tether, Weight
-from jiggle_mj.estimator.membrane import TriangleMembrane
-from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.surrogate import surrogate
 
 from jiggle_mj.observation import Declaration
+
+from ..physics.block_tridiagonal import Layout
+from ..physics.energy import SheetEnergy, Term
+from ..physics.environment import Tether, Weight
+from ..physics.membrane import TriangleMembrane
+from ..physics.mesh import SheetMesh
+from ..physics.surrogate import surrogate
+from .surface_points import Followed
+from .terms import Film, Load, Rub
 
 Kind = TypeVar("Kind", bound=Term)
 

@@ -15,10 +15,11 @@ report to report, so that a is a kick at each.
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.effects.effect import Effect
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel
-from jiggle_mj.estimator.effects.terms import Load
-from jiggle_mj.estimator.environment import Weight
+
+from ..physics.environment import Weight
+from .effect import Effect
+from .sheet_model import Moment, SheetModel
+from .terms import Load
 
 BESSEL = 2.404825557695773
 """First zero of J0."""

@@ -11,7 +11,8 @@ than e it is Coulomb's mu N against the way, and nothing for none.
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from jiggle_mj.estimator.energy import Term
+
+from ..physics.energy import Term
 
 STICK = 5e-5
 """e [m]."""

@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.belief import BoundaryBelief
-from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
-from jiggle_mj.estimator.filters.shots import SWEEPS, History, Shots, predicted, simulator
-from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.xpbd import XPBD
 
 from jiggle_mj.observation import Declaration
+
+from ..belief.boundary_belief import BoundaryBelief
+from ..physics.mesh import SheetMesh
+from ..physics.xpbd import XPBD
+from .evidence import Evidence, Filter, Update, not_stated
+from .shots import SWEEPS, History, Shots, predicted, simulator
 
 RATE = 1e-3
 """Adam's learning rate, which is about how far b moves in a step [membrane stiffness]."""

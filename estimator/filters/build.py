@@ -1,20 +1,20 @@
 """The filter that the settings name, for one sheet, and what it believes beforehand."""
 
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.belief import BoundaryBelief
-from jiggle_mj.estimator.config import EstimatorConfig
-from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.filters.adam import AdamShooting
-from jiggle_mj.estimator.filters.evidence import Filter
-from jiggle_mj.estimator.filters.explicit import PRIOR_MEAN, MultipleShooting
-from jiggle_mj.estimator.filters.force_balance import ForceBalance
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
-from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
-from jiggle_mj.estimator.filters.unscented import ReducedUnscented
-from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.surrogate import surrogate
-
 from jiggle_mj.observation import Declaration
+
+from ..belief.attachment_belief import AttachmentBelief
+from ..belief.boundary_belief import BoundaryBelief
+from ..config import EstimatorConfig
+from ..physics.energy import SheetEnergy
+from ..physics.mesh import SheetMesh
+from ..physics.surrogate import surrogate
+from .adam import AdamShooting
+from .evidence import Filter
+from .explicit import PRIOR_MEAN, MultipleShooting
+from .force_balance import ForceBalance
+from .implicit import ImplicitFilter, prior_belief
+from .nnls import NonNegativeLeastSquares
+from .unscented import ReducedUnscented
 
 FORCE_LEVEL = 0.07
 """Forces meeting at a particle, summed, of which the model gets `EstimatorConfig.force_sd` wrong [k x spacing]; its

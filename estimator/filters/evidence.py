@@ -6,9 +6,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.belief import BoundaryBelief
-from jiggle_mj.estimator.filters.noise import Noise
+
+from ..belief.attachment_belief import AttachmentBelief
+from ..belief.boundary_belief import BoundaryBelief
+from .noise import Noise
 
 
 class Pull(eqx.Module):

@@ -24,13 +24,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
-from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
-from jiggle_mj.estimator.filters.shots import SWEEPS, History, Shots, predicted, simulator, slopes
-from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.xpbd import XPBD
 
 from jiggle_mj.observation import Declaration
+
+from ..belief.boundary_belief import BoundaryBelief, entropy, standard_deviations
+from ..physics.mesh import SheetMesh
+from ..physics.xpbd import XPBD
+from .evidence import Evidence, Filter, Update, not_stated
+from .shots import SWEEPS, History, Shots, predicted, simulator, slopes
 
 PRIOR_MEAN = 1e-4
 """The paper's mu_0 [N/m]."""

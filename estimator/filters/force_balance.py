@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from jiggle_mj.estimator.block_tridiagonal import (
+
+from ..physics.block_tridiagonal import (
     BlockCholesky,
     BlockTridiagonal,
     Layout,
@@ -30,11 +31,11 @@ from jiggle_mj.estimator.block_tridiagonal import (
     solve,
     window_sums,
 )
-from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.filters.evidence import Evidence
-from jiggle_mj.estimator.filters.noise import Misfit
-from jiggle_mj.estimator.filters.tethered import Tethered
-from jiggle_mj.estimator.mesh import SheetMesh, neighbour_table, pattern, places_back
+from ..physics.energy import SheetEnergy
+from ..physics.mesh import SheetMesh, neighbour_table, pattern, places_back
+from .evidence import Evidence
+from .noise import Misfit
+from .tethered import Tethered
 
 ROUGH = 3.0
 """Unbalanced force at which a state is smooth enough to be linearised at, in standard deviations of the least force

@@ -14,15 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float, Int
-from jiggle_mj.estimator.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.attachment_prior import AttachmentPrior
-from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Stated, Update
-from jiggle_mj.estimator.filters.force_balance import Fit, ForceBalance, Frame, Information
-from jiggle_mj.estimator.filters.noise import Misfit, Noise
-from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.side_by_side import side_by_side
-from jiggle_mj.estimator.spike_and_slab import SpikeAndSlab
+
+from ..belief.attachment_belief import AttachmentBelief
+from ..belief.attachment_prior import AttachmentPrior
+from ..belief.spike_and_slab import SpikeAndSlab
+from ..parallel_map import side_by_side
+from ..physics.energy import SheetEnergy
+from ..physics.mesh import SheetMesh
+from .evidence import Evidence, Filter, Stated, Update
+from .force_balance import Fit, ForceBalance, Frame, Information
+from .noise import Misfit, Noise
 
 SPIKE = 3e-4
 """Width of s where free."""

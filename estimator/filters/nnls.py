@@ -13,10 +13,11 @@ forces that are wrong by tau independently.
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.belief import BoundaryBelief, entropy, standard_deviations
-from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
-from jiggle_mj.estimator.filters.tethered import Tethered
+
+from ..belief.boundary_belief import BoundaryBelief, entropy, standard_deviations
+from ..physics.energy import SheetEnergy
+from .evidence import Evidence, Filter, Update, not_stated
+from .tethered import Tethered
 
 
 class NonNegativeLeastSquares(eqx.Module, Filter):

@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from jiggle_mj.estimator.environment import Grip
-from jiggle_mj.estimator.filters.evidence import Evidence
-from jiggle_mj.estimator.membrane import EdgeMembrane
-from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.xpbd import XPBD, hinge_springs
 
 from jiggle_mj.observation import Declaration
+
+from ..physics.environment import Grip
+from ..physics.membrane import EdgeMembrane
+from ..physics.mesh import SheetMesh
+from ..physics.xpbd import XPBD, hinge_springs
+from .evidence import Evidence
 
 HINGE = 1 / 30
 """Stiffness of the springs across hinges [membrane stiffness]."""

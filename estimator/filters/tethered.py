@@ -7,10 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.environment import Tether
-from jiggle_mj.estimator.equilibrium import Equilibrium, equilibrium
-from jiggle_mj.estimator.filters.evidence import Evidence
+
+from ..physics.energy import SheetEnergy
+from ..physics.environment import Tether
+from ..physics.equilibrium import Equilibrium, equilibrium
+from .evidence import Evidence
 
 STEPS = 25
 """Most Newton steps."""

@@ -20,13 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float, Int
-from jiggle_mj.estimator.belief import BoundaryBelief, entropy, non_negative_minimum
-from jiggle_mj.estimator.energy import SheetEnergy
-from jiggle_mj.estimator.environment import Grip
-from jiggle_mj.estimator.equilibrium import equilibrium
-from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Update, not_stated
-from jiggle_mj.estimator.mesh import SheetMesh
 from scipy.cluster.vq import kmeans2
+
+from ..belief.boundary_belief import BoundaryBelief, entropy, non_negative_minimum
+from ..physics.energy import SheetEnergy
+from ..physics.environment import Grip
+from ..physics.equilibrium import equilibrium
+from ..physics.mesh import SheetMesh
+from .evidence import Evidence, Filter, Update, not_stated
 
 PATCHES = 40
 """r; on 10 cm x 10 cm a patch is 16 mm wide."""

@@ -5,12 +5,12 @@ Of images: tissue mask, disparity, the estimator's own mesh, and tracks of its p
 `lucas_kanade`) -> `stereo_tracker`, which holds it together. `sight` is the door to all three.
 """
 
-from jiggle_mj.estimator.perception.disparity import Disparity, SemiGlobalMatching
-from jiggle_mj.estimator.perception.point_tracker import PointTracker
-from jiggle_mj.estimator.perception.sight import Believed, Sight
-from jiggle_mj.estimator.perception.stereo_tracker import StereoTracker
-from jiggle_mj.estimator.perception.tissue_mask import TissueMask, WarmTissue
-from jiggle_mj.estimator.perception.track import Track
+from .disparity import Disparity, SemiGlobalMatching
+from .perception import Believed, Sight
+from .point_tracker import PointTracker
+from .stereo_tracker import StereoTracker
+from .tissue_mask import TissueMask, WarmTissue
+from .track import Track
 
 __all__ = [
     "Believed",

@@ -14,13 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Array, Bool, Float
-from jiggle_mj.estimator.chamfer import Chamfer
-from jiggle_mj.estimator.environment import Grip
-from jiggle_mj.estimator.filters.shots import simulator
-from jiggle_mj.estimator.mesh import SheetMesh
-from jiggle_mj.estimator.perception.point_tracker import FEWEST
-from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
-from jiggle_mj.estimator.xpbd import XPBD
 from scipy.spatial import KDTree
 
 from jiggle_mj.errors import PerceptionError
@@ -28,6 +21,14 @@ from jiggle_mj.estimate import Sheet
 from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.observation import Declaration, MeasuredPoints
 from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
+
+from ..filters.shots import simulator
+from ..physics.chamfer import Chamfer
+from ..physics.environment import Grip
+from ..physics.mesh import SheetMesh
+from ..physics.xpbd import XPBD
+from .point_tracker import FEWEST
+from .track import UNSEEN_VARIANCE, Track
 
 LONGEST_EDGE = 2.5
 """Triangles with a longer edge are no tissue [spacing]."""

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.estimator.perception.material_map import MaterialMap
+
+from .material_map import MaterialMap
 
 CONTRAST_FLOOR = 1.5
 """Grey levels of 255 added to the local standard deviation, so that noise on a bare patch is not made texture."""

@@ -8,13 +8,14 @@ from collections import Counter
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.observation import DeclaredMesh, MeasuredPoints
 from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
+
+from .track import UNSEEN_VARIANCE, Track
 
 LONGEST_EDGE = 2.5
 """Triangles with a longer edge are no tissue [medians of all edges]."""

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from jiggle_mj.estimator.perception.resampling import double
 
 from jiggle_mj.camera import CameraCalibration, StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.observation import StereoPair
+
+from .resampling import double
 
 DARK = 8.0
 """An image is black when even its 99th percentile stays below this grey value of 255 (sensor noise is 1 to 3)."""

@@ -9,19 +9,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.estimator.perception.lucas_kanade import (
-    Match,
-    Normalised,
-    Step,
-    gradients,
-    match,
-    normalise,
-    step_along,
-    step_in_plane,
-)
-from jiggle_mj.estimator.perception.material_map import MaterialMap
-from jiggle_mj.estimator.perception.mesh_field import MeshField
-from jiggle_mj.estimator.perception.resampling import sample_doubled
+
+from .lucas_kanade import Match, Normalised, Step, gradients, match, normalise, step_along, step_in_plane
+from .material_map import MaterialMap
+from .mesh_field import MeshField
+from .resampling import sample_doubled
 
 FINE = 4.0
 """Standard deviation of the matching window [px]."""

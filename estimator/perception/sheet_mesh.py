@@ -10,13 +10,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from jiggle_mj.estimator.perception.tissue_mask import SECOND_BLOB
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
+
+from .tissue_mask import SECOND_BLOB
 
 FEWEST_PARTICLES = 30
 """Below this a sheet is too coarse to say anything about where it is attached."""

@@ -10,12 +10,18 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from jiggle_mj.estimator.perception.disparity import Disparity, SemiGlobalMatching
-from jiggle_mj.estimator.perception.flow import dense_flow, flow_at
-from jiggle_mj.estimator.perception.material_map import MaterialMap
-from jiggle_mj.estimator.perception.mesh_field import MeshField
-from jiggle_mj.estimator.perception.rectified import RectifiedPair, Rectifier
-from jiggle_mj.estimator.perception.registration import (
+
+from jiggle_mj.camera import StereoCamera
+from jiggle_mj.errors import PerceptionError
+from jiggle_mj.estimate import Sheet
+from jiggle_mj.observation import StereoPair, ToolState
+
+from .disparity import Disparity, SemiGlobalMatching
+from .flow import dense_flow, flow_at
+from .material_map import MaterialMap
+from .mesh_field import MeshField
+from .rectified import RectifiedPair, Rectifier
+from .registration import (
     COARSE,
     FINE,
     LEAST_CORRELATION,
@@ -24,14 +30,9 @@ from jiggle_mj.estimator.perception.registration import (
     refine_disparity,
     sample_mask,
 )
-from jiggle_mj.estimator.perception.sheet_mesh import LEAST_MATCHED, DisparitySurface, lay_mesh
-from jiggle_mj.estimator.perception.tissue_mask import TissueMask, WarmTissue, largest_blob
-from jiggle_mj.estimator.perception.track import UNSEEN_VARIANCE, Track
-
-from jiggle_mj.camera import StereoCamera
-from jiggle_mj.errors import PerceptionError
-from jiggle_mj.estimate import Sheet
-from jiggle_mj.observation import StereoPair, ToolState
+from .sheet_mesh import LEAST_MATCHED, DisparitySurface, lay_mesh
+from .tissue_mask import TissueMask, WarmTissue, largest_blob
+from .track import UNSEEN_VARIANCE, Track
 
 FAR = 2.0
 """A tool that moved further than this between two frames may have taken the tissue further than flow follows

@@ -6,13 +6,13 @@ imports happen inside the verbs, so that help is quick.
 
 import tyro
 
-from jiggle_mj.allocator import keep_freed_memory
-from jiggle_mj.cli.checks import bench, doctor, scene_check
-from jiggle_mj.cli.estimating import close_loop, estimate, identify, run, score
-from jiggle_mj.cli.recording import import_, record
-from jiggle_mj.cli.tables import table
-from jiggle_mj.cli.terminal import stop
-from jiggle_mj.errors import JiggleError, OptionError, OutputError, SceneError
+from ..allocator import keep_freed_memory
+from ..errors import JiggleError, OptionError, OutputError, SceneError
+from .checks import bench, doctor, scene_check
+from .estimating import close_loop, estimate, identify, run, score
+from .recording import import_, record
+from .tables import table
+from .terminal import stop
 
 VERBS = {
     "run": run,

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import tyro
 from rich.table import Table
 
-from jiggle_mj.cli.options import AsJson, Disturb, Name
-from jiggle_mj.cli.terminal import console, say
+from .options import AsJson, Disturb, Name
+from .terminal import console, say
 
 
 def bench(
@@ -30,10 +30,10 @@ def bench(
         gate: fail where something became worse than the committed baseline allows.
         as_json: print the figures to stdout.
     """
-    from jiggle_mj.eval.benchmark import SIZES, baseline, benchmark, regressions
+    from jiggle_mj.eval.benchmark.estimator_benchmark import SIZES, baseline, benchmark, regressions
 
     if part == "reference":
-        from jiggle_mj.eval import reference_benchmark as reference
+        from jiggle_mj.eval.benchmark import reference_benchmark as reference
 
         metrics = reference.reference_benchmark(sizes or reference.SIZES, say=say)
     else:
@@ -86,7 +86,7 @@ def doctor(*, as_json: AsJson = False) -> None:
     Args:
         as_json: print the checks to stdout.
     """
-    from jiggle_mj.doctor import doctor as examine
+    from ..doctor import doctor as examine
 
     checks = examine()
     table = Table("", "check", "found", "what to do", box=None)

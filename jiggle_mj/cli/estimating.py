@@ -6,9 +6,9 @@ from pathlib import Path
 
 from rich.table import Table
 
-from jiggle_mj.cli.options import AsJson, Disturb, FilterName, Name, Out, PathArgument, Sensing
-from jiggle_mj.cli.terminal import console, patient, progress, show, stop
-from jiggle_mj.policies import PolicyName
+from ..policies import PolicyName
+from .options import AsJson, Disturb, FilterName, Name, Out, PathArgument, Sensing
+from .terminal import console, patient, progress, show, stop
 
 
 def run(
@@ -44,8 +44,8 @@ def run(
         as_json: print result.json to stdout.
     """
     from jiggle_mj.estimator import EstimatorConfig
-    from jiggle_mj.eval.acting import most_actions
-    from jiggle_mj.eval.experiment import run_scene
+    from jiggle_mj.eval.runs.acting import most_actions
+    from jiggle_mj.eval.runs.experiment import run_scene
     from jiggle_mj.scenes import disturbed, load_scene
 
     loaded, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)
@@ -88,8 +88,9 @@ def estimate(
         as_json: print result.json to stdout.
     """
     from jiggle_mj.estimator import EstimatorConfig
-    from jiggle_mj.eval.experiment import run_estimator
-    from jiggle_mj.recording import Recording
+    from jiggle_mj.eval.runs.experiment import run_estimator
+
+    from ..recording.reader import Recording
 
     length = len(Recording.open(recording, allow_truncated=allow_truncated))
     with progress(length, f"estimate {recording.name}") as on_frame:
@@ -112,9 +113,10 @@ def identify(recording: PathArgument, /, *, allow_truncated: bool = False, as_js
         allow_truncated: use what is whole of a recording that was cut off.
         as_json: print what was found to stdout.
     """
-    from jiggle_mj import episode
     from jiggle_mj.estimator import Estimator
-    from jiggle_mj.recording import Recording
+
+    from .. import episode
+    from ..recording.reader import Recording
 
     source = Recording.open(recording, allow_truncated=allow_truncated)
     estimator = Estimator(source.declaration, source.camera)
@@ -166,10 +168,11 @@ def close_loop(
         overwrite: replace results that are already in the folder.
         as_json: print discrepancy.json to stdout.
     """
-    from jiggle_mj.eval.closing_the_loop import PAGE
-    from jiggle_mj.eval.closing_the_loop import close_loop as close
-    from jiggle_mj.eval.discrepancy_page import story
-    from jiggle_mj.recording import Recording
+    from jiggle_mj.eval.report.discrepancy_page import story
+    from jiggle_mj.eval.runs.closing_the_loop import PAGE
+    from jiggle_mj.eval.runs.closing_the_loop import close_loop as close
+
+    from ..recording.reader import Recording
 
     length = len(Recording.open(recording, allow_truncated=allow_truncated))
     with progress(length, f"follow {recording.name}") as on_frame:
@@ -201,6 +204,6 @@ def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = N
             the folder.
         as_json: print result.json to stdout.
     """
-    from jiggle_mj.eval.experiment import score_directory
+    from jiggle_mj.eval.runs.experiment import score_directory
 
     show(score_directory(directory, truth, recording=recording, say=console.print), directory, as_json)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jiggle_mj.cli.options import AsJson, Disturb, Name, Out, PathArgument, Sensing
-from jiggle_mj.cli.terminal import bar, console, progress, stop
-from jiggle_mj.errors import OptionError
+from ..errors import OptionError
+from .options import AsJson, Disturb, Name, Out, PathArgument, Sensing
+from .terminal import bar, console, progress, stop
 
 if TYPE_CHECKING:
     from jiggle_mj.scenes import Scene
@@ -46,9 +46,10 @@ def record(
         overwrite: replace files that are already there.
         as_json: print what was written to stdout.
     """
-    from jiggle_mj.episode import observe
-    from jiggle_mj.mcap_files import truth_path
     from jiggle_mj.scenes import Reference, disturbed, load_scene, programme
+
+    from ..episode import observe
+    from ..recording.mcap_files import truth_path
 
     if count is None and (jobs is not None or executor is not None):
         raise OptionError(f"--{'jobs' if executor is None else 'executor'} is for many recordings: give --count too.")
@@ -92,9 +93,9 @@ def _record_series(
     as_json: bool,
 ) -> None:
     """Many recordings of a scene; leaves with 1 where some failed, with 130 after Ctrl-C."""
-    from jiggle_mj.cluster import cluster
-    from jiggle_mj.recording_series import record_series
-    from jiggle_mj.worker_processes import WorkerProcesses
+    from ..cluster import cluster
+    from ..series import record_series
+    from ..worker_processes import WorkerProcesses
 
     if jobs is not None and executor is not None:
         raise OptionError("--jobs is for this machine, --executor for others: give one of them.")
@@ -146,7 +147,7 @@ def import_(
         overwrite: replace files that are already there.
         as_json: print a summary to stdout.
     """
-    from jiggle_mj.importing import import_folder
+    from ..importing.folder import import_folder
 
     summary = import_folder(folder, recording, out, overwrite=overwrite)
     for name, why in summary.skipped:

@@ -4,9 +4,9 @@ from typing import Annotated
 
 import tyro
 
-from jiggle_mj.cli.options import Out, RowsName, Sensing, TableName
-from jiggle_mj.cli.terminal import console, say
-from jiggle_mj.errors import OptionError
+from ..errors import OptionError
+from .options import Out, RowsName, Sensing, TableName
+from .terminal import console, say
 
 
 def table(
@@ -34,7 +34,8 @@ def table(
         rows: of undeclared: one effect of the library, two together, one from images, what is outside the library, or
             nothing; all if left out.
     """
-    from jiggle_mj.eval import paper_tables, tables
+    from jiggle_mj.eval.studies import main_table as tables
+    from jiggle_mj.eval.studies import paper_tables
 
     if sensing is not None and name != "active":
         raise OptionError(f"--sensing is for the table active; got {name}.")
@@ -45,8 +46,9 @@ def table(
     if name == "main":
         print(tables.markdown(tables.measure(tables.MAIN, seeds or range(3), out, say=say)))
     elif name == "active":
-        from jiggle_mj.eval import active_table
-        from jiggle_mj.worker_processes import WorkerProcesses
+        from jiggle_mj.eval.studies import active_table
+
+        from ..worker_processes import WorkerProcesses
 
         with WorkerProcesses(jobs) as executor:
             runs = active_table.measure(
@@ -62,23 +64,25 @@ def table(
         active_table.write_curves(runs, out / active_table.FILE)
         console.print(f"curves: {out / active_table.FILE}")
     elif name == "acts":
-        from jiggle_mj.eval import acts_table
-        from jiggle_mj.worker_processes import WorkerProcesses
+        from jiggle_mj.eval.studies import acts_table
+
+        from ..worker_processes import WorkerProcesses
 
         with WorkerProcesses(jobs) as executor:
             found = acts_table.measure(acts_table.SCENES, seeds or range(6), out, executor=executor, say=say)
         print(acts_table.markdown(found))
     elif name == "undeclared":
-        from jiggle_mj.eval import undeclared_table as undeclared
-        from jiggle_mj.eval.undeclared_panel import GROUPS
-        from jiggle_mj.worker_processes import WorkerProcesses
+        from jiggle_mj.eval.studies import undeclared_table as undeclared
+        from jiggle_mj.eval.studies.undeclared_panel import GROUPS
+
+        from ..worker_processes import WorkerProcesses
 
         names = [name for group in (rows or GROUPS) for name in GROUPS[group]]
         with WorkerProcesses(jobs) as executor:
             closed = undeclared.measure(names, seeds or range(5), out, executor=executor, say=say)
         print(undeclared.markdown(closed))
     elif name == "scalability":
-        from jiggle_mj.eval import scalability
+        from jiggle_mj.eval.studies import scalability
 
         print(scalability.markdown(scalability.scalability(scalability.SIZES, say=say)))
     else:

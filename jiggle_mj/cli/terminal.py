@@ -14,9 +14,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from jiggle_mj.episode import OnFrame
-    from jiggle_mj.estimate import Estimate
-    from jiggle_mj.observation import Observation
+    from ..episode import OnFrame
+    from ..estimate import Estimate
+    from ..observation import Observation
 
 console = Console(stderr=True)
 
@@ -73,7 +73,7 @@ def bar(total: int, title: str) -> Iterator[Callable[..., None]]:
 
 def show(figures: dict, out: Path, as_json: bool) -> None:
     """What was found, in a few lines; the whole of it with --json."""
-    from jiggle_mj.eval.verdict import doubts
+    from jiggle_mj.eval.report.verdict import doubts
 
     detection, calibration = figures["detection"], figures["calibration"]
     console.print(

@@ -1,0 +1,1 @@
+"""The belief over the attachment stiffnesses."""

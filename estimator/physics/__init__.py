@@ -1,0 +1,1 @@
+"""The surrogate's physics: mesh, energies, equilibrium, XPBD and their linear algebra."""

@@ -1,0 +1,49 @@
+"""The estimator's model of one sheet: its mesh and what the user declares, put together as an energy.
+
+Everything that the declaration does not say (the bed's softness, the stiffness of a grip) scales with the declared
+membrane stiffness, because positions know only ratios.
+"""
+
+from typing import Literal
+
+import numpy as np
+
+from jiggle_mj.observation import Declaration
+
+from .bending import IsometricBending
+from .block_tridiagonal import Layout
+from .energy import SheetEnergy, Term
+from .environment import Bed, Weight
+from .hanging import Tension, as_it_hangs
+from .membrane import EdgeMembrane, TriangleMembrane
+from .mesh import SheetMesh
+
+BED_STIFFNESS = 1 / 3
+"""Of the bed under one particle, as a share of the membrane stiffness."""
+
+Membrane = Literal["triangles", "edges"]
+
+
+def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane = "triangles") -> SheetEnergy:
+    """Membrane, bending, weight, and bed or tension of a sheet; attachments and grip are added by who uses it."""
+    k, nu = declaration.membrane_stiffness, declaration.poisson
+    plate = k * declaration.thickness**2 / (12 * (1 - nu**2))
+    elastic = (
+        TriangleMembrane.build(mesh, stiffness=k, poisson=nu)
+        if membrane == "triangles"
+        else EdgeMembrane.build(mesh, stiffness=k)
+    )
+    terms: list[Term] = [elastic, IsometricBending.build(mesh, stiffness=plate)]
+    gravity = np.asarray(declaration.gravity, dtype=float)
+    if gravity.any():
+        down = as_it_hangs(mesh, gravity) if declaration.hangs else None
+        pull = tuple(gravity if down is None else down)
+        weight = Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=pull)
+        terms.append(weight)
+        if down is not None:
+            terms.append(Tension.build(mesh, weight, poisson=nu))
+        if declaration.bed:
+            up = -gravity / np.linalg.norm(gravity)
+            load = -np.asarray(weight.force) @ up
+            terms.append(Bed.build(mesh.rest, load=load, up=up, stiffness=BED_STIFFNESS * k))
+    return SheetEnergy.build(mesh.rest, tuple(terms), Layout.from_pattern(mesh.adjacency, mesh.rest))

@@ -1,0 +1,80 @@
+"""What was found, in one or two sentences for people."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jiggle_mj.estimate import Belief, Detection, Sheet
+
+from ..metrics.detection import dilate, patches
+from ..metrics.flat_map import Plane
+from ..metrics.truth_transfer import CarriedTruth
+
+POOR_FIT = 1.5
+"""A noise that is wider by more than this is worth a word."""
+NAMED_PATCHES = 3
+"""Patches whose place is spelled out; the others are counted."""
+
+
+def found(sheet: Sheet, detection: Detection, plane: Plane) -> str:
+    """How many particles are reported attached, in which patches, where, and how stiff."""
+    groups = patches(detection.attached, sheet.faces)
+    total = int(detection.attached.sum())
+    if not groups:
+        return "No particle is reported attached."
+    flat, (first, second) = plane.flatten(sheet.rest) * 1e3, plane.names
+    places = []
+    for group in groups[:NAMED_PATCHES]:
+        x, y = flat[group].mean(axis=0)
+        places.append(f"{len(group)} around {first} = {_integer(x)} mm, {second} = {_integer(y)} mm")
+    rest = len(groups) - len(places)
+    listed = "; ".join(places) + (f"; and {rest} smaller {'one' if rest == 1 else 'ones'}" if rest > 0 else "")
+    verb = "particle is" if total == 1 else "particles are"
+    counted = "in one patch" if len(groups) == 1 else f"in {len(groups)} patches"
+    stiffness = float(np.mean(detection.stiffness[detection.attached]))
+    return f"{total} {verb} reported attached, {counted} ({listed}), at {stiffness:.2g} N/m each on average."
+
+
+def against_truth(sheet: Sheet, detection: Detection, carried: CarriedTruth) -> str:
+    """How many of the reported are right, and how many of the attached were found, exactly and within one ring."""
+    detected, attached = detection.attached, carried.attached
+    n_detected, n_attached = int(detected.sum()), int(attached.sum())
+    if not n_attached:
+        return "In truth nothing is attached." + (f" All {n_detected} reports are false." if n_detected else "")
+    wide, grown = dilate(attached, sheet.faces, 1), dilate(detected, sheet.faces, 1)
+    exact, near = int((attached & detected).sum()), int((attached & grown).sum())
+    text = f"In truth {n_attached} {'is' if n_attached == 1 else 'are'} attached: "
+    text += f"{exact} of them reported exactly, {near} within one mesh ring"
+    if n_detected:
+        false = int((detected & ~wide).sum())
+        verb = "lie" if false > 1 else "lies"
+        text += f"; {false or 'none'} of the {n_detected} reports {verb} more than one ring off"
+    return text + "."
+
+
+def stiffness_sums(sheet: Sheet, belief: Belief, detection: Detection, carried: CarriedTruth) -> str:
+    """Over the attached particles and one ring around them: the estimated sum of b, its deviation, and the true one."""
+    if not carried.attached.any() or not np.isfinite(carried.stiffness).all():
+        return ""
+    near = dilate(carried.attached, sheet.faces, 1)
+    sd = belief.deviation_of_sum(detection.stiffness, near)
+    stated = f"a stated standard deviation of {sd:.1f}" if np.isfinite(sd) else "no stated deviation"
+    total, true = detection.stiffness[near].sum(), carried.stiffness[near].sum()
+    return f"Over these and one ring around them b sums to {total:.1f} N/m, with {stated}; the truth is {true:.1f}."
+
+
+def doubts(figures: Mapping[str, Any]) -> list[str]:
+    """Why to trust what was found less, from `result.json`; of a version that did not say, nothing."""
+    said = []
+    if not figures["detection"].get("converged", True):
+        said.append("Two halves of the samples disagree: more of them would give other probabilities.")
+    noise = figures.get("noise", {})
+    for name, what in (("force_sd_ratio", "The model's forces"), ("position_sd_ratio", "The positions")):
+        if (ratio := noise.get(name)) is not None and ratio > POOR_FIT:
+            said.append(f"{what} are off by {ratio:.1f} times what was stated, and were trusted that much less.")
+    return said
+
+
+def _integer(value: float) -> str:
+    return f"{value:+.0f}".replace("-", "\N{MINUS SIGN}").replace("+0", "0").lstrip("+")

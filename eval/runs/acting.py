@@ -1,0 +1,126 @@
+"""Which actions a run takes: the scene's own programme, or those of a policy that looks at the estimate."""
+
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from itertools import chain, takewhile
+from typing import TYPE_CHECKING
+
+from jiggle_mj.errors import OptionError
+from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.estimator.planning.information_policy import Information
+from jiggle_mj.estimator.planning.paper_policies import PAPER, Primitive
+from jiggle_mj.estimator.planning.policy import Policy
+from jiggle_mj.estimator.planning.procedures import Detach, Procedure, Sew
+from jiggle_mj.estimator.planning.tool_kinematics import Tweezer
+from jiggle_mj.observation import Action
+from jiggle_mj.policies import POLICIES, PRIMITIVES
+
+from ..metrics.score import Json
+
+if TYPE_CHECKING:
+    from jiggle_mj.scenes import Scene
+
+STEPS, LONG = 40, 400
+"""Most actions of a policy, and of one that cuts or sews, if nothing else is said."""
+
+
+def policy_named(name: str | None, scene: "Scene", *, seed: int) -> Policy | None:
+    """A fresh policy; None for the scene's programme.
+
+    Args:
+        name: one of `POLICIES`; None for the scene's own.
+        scene: its limits are kept.
+        seed: draws what the policy draws.
+
+    Raises:
+        OptionError: no such policy.
+    """
+    name, limits = scene.programme.policy if name is None else name, scene.limits.limits()
+    if name not in POLICIES:
+        raise OptionError(f"policy = {name!r}: must be one of {', '.join(POLICIES)}.")
+    if name == "corners":
+        return None
+    if name in PAPER:
+        return PAPER[name](limits, seed=seed)
+    if name in PRIMITIVES:
+        return Primitive(name.removeprefix("pmp-"))
+    look = partial(Information, limits, radius=scene.tweezer.radius, seed=seed, tweezer=_tweezer())
+    if name == "information":
+        return look()
+    if name == "one-grasp":
+        return look(regrasps=False)
+    if name == "detach":
+        return Detach(look)
+    plan = scene.procedure
+    return Sew(look, length=plan.suture_length, width=plan.suture_width, stiffness=plan.suture_stiffness)
+
+
+@cache
+def _tweezer() -> Tweezer:
+    from jiggle_mj.scenes.tissue.model import TWEEZER
+
+    return Tweezer.read(TWEEZER.read_text(encoding="utf-8"))
+
+
+def check_goes_with(policy: Policy, config: EstimatorConfig) -> None:
+    """Check that a policy can read the belief.
+
+    Raises:
+        OptionError: it predicts pulls, and the filter is not the one that can.
+    """
+    if isinstance(policy, Information | Procedure) and config.filter != "implicit":
+        raise OptionError(
+            f"information, one-grasp, detach and suture plan with the filter 'implicit'; got {config.filter!r}. "
+            "Leave --estimator out, or choose a policy of the paper's."
+        )
+
+
+def actions(
+    scene: "Scene",
+    policy: Policy | None,
+    estimator: Estimator,
+    steps: int | None = None,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+) -> Iterator[Action]:
+    """What the tool does, in order, until `stop` says so: who does not choose its grasps is given the scene's first."""
+    from jiggle_mj.scenes.scene.programme import programme
+
+    first = programme(scene) if policy is None else _beginning(scene, policy)
+    first = takewhile(lambda _: not stop(), first)
+    return first if policy is None else chain(first, policy.actions(estimator, steps=_most(policy, steps), stop=stop))
+
+
+def acts(policy: Policy | None, estimator: Estimator) -> Json | None:
+    """The procedure's part of result.json: each cut or suture with the evidence that it worked; None if it is none."""
+    if not isinstance(policy, Procedure):
+        return None
+    seen: list[object] = [
+        {"frame": one.index, "kind": type(one.event).__name__.lower(), "log_bayes_factor": estimator.worked(one)}
+        for one in estimator.changes
+    ]
+    return {"name": policy.name, "cycles": len(seen), "success": None, "acts": seen}
+
+
+def most_actions(scene: "Scene", name: str | None, steps: int | None = None) -> int:
+    """How many there are at most, for progress."""
+    from jiggle_mj.scenes.scene.programme import programme
+
+    policy = policy_named(name, scene, seed=0)
+    if policy is None:
+        return sum(1 for _ in programme(scene))
+    return _most(policy, steps) + sum(1 for _ in _beginning(scene, policy))
+
+
+def _most(policy: Policy, steps: int | None) -> int:
+    if steps is not None and steps < 1:
+        raise OptionError(f"steps = {steps}: must be at least 1.")
+    return steps or (LONG if isinstance(policy, Procedure) else STEPS)
+
+
+def _beginning(scene: "Scene", policy: Policy) -> Iterator[Action]:
+    from jiggle_mj.scenes.scene.programme import opening, still
+
+    if isinstance(policy, Information):
+        return still(scene) if policy.regrasps else opening(scene, height=0.0)
+    return still(scene) if isinstance(policy, Procedure) else opening(scene)

@@ -1,0 +1,107 @@
+"""Closes the loop over a recording: files in, `discrepancy.json` and a page of pictures out.
+
+The truth, where one is given, is opened when all is decided and kept, and only adds what was found of the attachments
+before and after.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from jiggle_mj.episode import OnFrame, check_directory, clear_directory
+from jiggle_mj.errors import RecordingError
+from jiggle_mj.estimate import Sheet
+from jiggle_mj.estimator import EstimatorConfig
+from jiggle_mj.estimator.attribution.closing import close_the_loop
+from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
+from jiggle_mj.estimator.attribution.gather import gather
+from jiggle_mj.estimator.attribution.suggestion import suggest
+from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.effects import LIBRARY, Effect
+from jiggle_mj.recording.declaration import made_by
+from jiggle_mj.recording.reader import Recording
+from jiggle_mj.recording.truth import read_truth
+from jiggle_mj.truth import Truth
+
+from ..metrics.score import Json, agreements
+from ..metrics.truth_transfer import carry
+from ..report.discrepancy_page import write_page
+
+DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
+
+
+def close_loop(
+    recording_path: Path,
+    directory: Path,
+    *,
+    truth: Path | None = None,
+    library: tuple[Effect, ...] = LIBRARY,
+    suggestion: bool = False,
+    overwrite: bool = False,
+    allow_truncated: bool = False,
+    on_frame: OnFrame = lambda observation, found: None,
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Find what the model lacks of a recording, add it, and report the error before and after.
+
+    Args:
+        recording_path: the MCAP file.
+        directory: where discrepancy.json and discrepancy.html go.
+        truth: a truth file, to score what is found attached before and after; looked at when all is decided.
+        library: effects that are looked for; `(*LIBRARY, mine)` adds one.
+        suggestion: look for the pull that best tells apart what these frames cannot.
+        overwrite: replace an earlier run's files.
+        allow_truncated: use what is whole of a recording that was cut off.
+        on_frame: called after each frame of the first estimate.
+        say: told what is being done.
+
+    Returns:
+        The content of discrepancy.json.
+
+    Raises:
+        JiggleError: what any of the parts raises.
+        ValueError: an effect of the library gives no finite derivative, or changes a shape.
+    """
+    recording = Recording.open(recording_path, allow_truncated=allow_truncated)
+    own = (DISCREPANCY, PAGE)
+    check_directory(directory, own, overwrite=overwrite)
+    clear_directory(directory, own)
+    gathered = gather(recording.declaration, recording.camera, recording, config=EstimatorConfig(), on_frame=on_frame)
+    with jax.enable_x64(True), one_thread():
+        closed = close_the_loop(gathered, library=library, say=say)
+        found = made_by() | discrepancy(closed, gathered)
+    sheet, name = gathered.estimator.sheet, recording.metadata.get("name", recording_path.stem)
+
+    def keep() -> None:
+        (directory / DISCREPANCY).write_text(json.dumps(found, indent=1) + "\n")
+        write_page(directory / PAGE, name=name, sheet=sheet, found=found)
+
+    keep()
+    if truth is not None:
+        true = read_truth(truth)
+        if true.identity != recording.metadata.get("identity", ""):
+            raise RecordingError(f"{truth} is not the truth of {recording_path}.")
+        last = gathered.frames[-1].index
+        for when, fitted in (("before", closed.stages[0].fitted), ("after", closed.final)):
+            found[f"detection_{when}"] = _scored(sheet, fitted.attached, true, last)
+        keep()
+    if suggestion:
+        with jax.enable_x64(True), one_thread():
+            best = suggest(closed, gathered, say=say)
+        found["suggestion"] = None if best is None else suggested(best)
+        keep()
+    return found
+
+
+def _scored(sheet: Sheet, detected: Bool[np.ndarray, " n"], truth: Truth, index: int) -> Json:
+    carried = carry(sheet, truth, index)
+    return {
+        "n_detected": int(detected.sum()),
+        "n_attached": int(carried.attached.sum()),
+        "by_dilation": agreements(sheet, detected, carried),
+    }

@@ -1,0 +1,1 @@
+"""Measured data of other formats becomes recordings."""

@@ -1,0 +1,180 @@
+"""The contents of a recording's file: its topics, everything small read at once, and where the rest is.
+
+Takes the topics it knows, counts the others, refuses truth and what is no recording. Images and points are handed out
+later, still encoded; grouping them into moments is `recording_moments`, turning them into observations `recording`.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration as CalibrationMessage
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
+from mcap.records import Channel, Message, Metadata, Schema
+
+from ..errors import RecordingError
+from ..observation import Cut, Declaration, Suture
+from .declaration import DECLARATION, MESH, METADATA, parse_declaration, with_mesh
+from .events import parse_event
+from .frames import FrameTree
+from .mcap_files import iterate_records
+from .pairing import Stamped
+from .schemas import parse_grasp, stamp_of
+
+LEFT, RIGHT = "/camera/left/image_raw", "/camera/right/image_raw"
+LEFT_INFO, RIGHT_INFO = "/camera/left/camera_info", "/camera/right/camera_info"
+TF, POSE, GRASP, POINTS, EVENT = "/tf", "/tool/pose", "/tool/grasp", "/tissue/points", "/event/topology"
+AS_JSON = (GRASP, EVENT)
+SCHEMAS: dict[str, tuple[Any, ...]] = {
+    LEFT: (CompressedImage, RawImage),
+    RIGHT: (CompressedImage, RawImage),
+    LEFT_INFO: (CalibrationMessage,),
+    RIGHT_INFO: (CalibrationMessage,),
+    TF: (FrameTransforms,),
+    POSE: (PoseInFrame,),
+    POINTS: (PointCloud,),
+}
+"""The topics that are read as protobuf, and the classes allowed on each."""
+
+
+class RecordingContents:
+    """One file, read once from end to end when this is made.
+
+    Raises:
+        RecordingError: missing, not an MCAP, truncated, damaged, foreign, holding truth, uncalibrated.
+    """
+
+    def __init__(self, path: Path, *, allow_truncated: bool) -> None:
+        self.path, self._allow_truncated = path, allow_truncated
+        self.metadata: dict[str, str] = {}
+        self.declaration = Declaration()
+        self.frames = FrameTree()
+        self.calibrations: dict[str, CalibrationMessage] = {}
+        self.poses: dict[int, PoseInFrame] = {}
+        self.grasps: dict[int, dict[str, Any]] = {}
+        self.stamped: dict[str, list[Stamped]] = {topic: [] for topic in (LEFT, RIGHT, POINTS, POSE, GRASP)}
+        self.events: list[tuple[int, Cut | Suture]] = []
+        """Stamp [ns] of each, in order."""
+        self._classes: dict[int, Any] = {}
+        ignored: Counter[str] = Counter()
+        for ordinal, topic, message in self._messages():
+            if topic == EVENT:
+                self.events.append((message.log_time, parse_event(message.data)))
+            elif topic == GRASP or topic in SCHEMAS:
+                self._take_in(ordinal, topic, message)
+            else:
+                ignored[topic] += 1
+        self.events.sort(key=lambda stamped: stamped[0])
+        self.ignored = dict(sorted(ignored.items()))
+        self._refuse_incomplete()
+
+    @property
+    def has_images(self) -> bool:
+        """Whether any image was recorded."""
+        return bool(self.stamped[LEFT] or self.stamped[RIGHT])
+
+    def encoded(self, wanted: dict[int, str]) -> Iterator[tuple[int, Any]]:
+        """Messages by their ordinals, parsed and not yet decoded, in file order.
+
+        Args:
+            wanted: topic of each message by ordinal.
+        """
+        for ordinal, topic, message in self._messages():
+            if ordinal in wanted:
+                yield ordinal, self._parse(topic, message)
+
+    def _take_in(self, ordinal: int, topic: str, message: Message) -> None:
+        stamp = message.log_time
+        if topic == GRASP:
+            self.grasps[ordinal] = parse_grasp(message.data)
+        else:
+            parsed = self._parse(topic, message)
+            if isinstance(parsed, CalibrationMessage):
+                self.calibrations.setdefault(topic, parsed)
+                return
+            if isinstance(parsed, FrameTransforms):
+                self.frames.add(parsed)
+                return
+            if isinstance(parsed, PoseInFrame):
+                self.poses[ordinal] = parsed
+            if parsed.HasField("timestamp"):
+                stamp = stamp_of(parsed)
+        self.stamped[topic].append(Stamped(stamp=stamp, ordinal=ordinal))
+
+    def _messages(self) -> Iterator[tuple[int, str, Message]]:
+        """Messages with their ordinal and topic; metadata and declaration are kept on the way."""
+        schemas: dict[int, Schema] = {}
+        topics: dict[int, str] = {}
+        ordinal = 0
+        for record in iterate_records(self.path, allow_truncated=self._allow_truncated):
+            if isinstance(record, Message):
+                yield ordinal, topics[record.channel_id], record
+                ordinal += 1
+            elif isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self._refuse_truth(record.topic)
+                topics[record.id] = record.topic
+                self._choose_class(record, schemas.get(record.schema_id))
+            elif isinstance(record, Metadata):
+                if record.name == METADATA:
+                    self.metadata = dict(record.metadata)
+                elif record.name == DECLARATION:
+                    self.declaration = parse_declaration(record.metadata.get("json", ""))
+            elif record.name == MESH:
+                self.declaration = with_mesh(self.declaration, record, self.path)
+
+    def _parse(self, topic: str, message: Message) -> Any:
+        kind = self._classes[message.channel_id]
+        try:
+            return kind.FromString(message.data)
+        except DecodeError as failure:
+            raise RecordingError(f"{self.path}: a message on {topic} is not a {kind.__name__}: {failure}.") from failure
+
+    def _choose_class(self, channel: Channel, schema: Schema | None) -> None:
+        name, encoding = (schema.name if schema else "without a schema"), channel.message_encoding
+        if channel.topic in AS_JSON and encoding != "json":
+            raise RecordingError(f"{self.path}: {channel.topic} is {name} ({encoding}); it must be JSON.")
+        if channel.topic not in SCHEMAS:
+            return
+        kinds = {kind.DESCRIPTOR.full_name: kind for kind in SCHEMAS[channel.topic]}
+        if encoding != "protobuf" or name not in kinds:
+            raise RecordingError(
+                f"{self.path}: {channel.topic} is {name} ({encoding}); it must be {' or '.join(kinds)} (protobuf)."
+            )
+        self._classes[channel.id] = kinds[name]
+
+    def _refuse_truth(self, topic: str) -> None:
+        if topic.startswith("/truth/"):
+            name = self.path.name
+            advice = f" (pass {name.replace('.truth.', '.')})" if ".truth." in name else ""
+            raise RecordingError(f"{name} holds /truth topics; the estimator reads observations only{advice}.")
+
+    def _refuse_incomplete(self) -> None:
+        """Refuse a file without a tool, with neither a stereo pair nor points, or without calibration."""
+        found = {topic for topic, messages in self.stamped.items() if messages} | set(self.calibrations)
+        sensors = f"{POINTS} or the pair {LEFT}, {RIGHT}"
+        if not found:
+            raise RecordingError(
+                f"{self.path} is foreign: it needs {POSE}, {GRASP} and {sensors}; "
+                f"its topics are: {', '.join(self.ignored) or 'none'}."
+            )
+        missing = [topic for topic in (POSE, GRASP) if topic not in found]
+        if bool(self.stamped[LEFT]) != bool(self.stamped[RIGHT]):
+            missing.append(LEFT if self.stamped[RIGHT] else RIGHT)
+        if not (self.has_images or self.stamped[POINTS]):
+            missing.append(sensors)
+        if missing:
+            raise RecordingError(
+                f"{self.path} lacks {' and '.join(missing)}; its topics are: "
+                f"{', '.join(sorted(found | set(self.ignored)))}."
+            )
+        uncalibrated = [topic for topic in (LEFT_INFO, RIGHT_INFO) if topic not in self.calibrations]
+        if self.has_images and uncalibrated:
+            raise RecordingError(f"{self.path} has images but no calibration: it lacks {' and '.join(uncalibrated)}.")

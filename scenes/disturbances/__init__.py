@@ -1,0 +1,1 @@
+"""What a scene can carry without telling the estimator."""

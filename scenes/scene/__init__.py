@@ -1,0 +1,1 @@
+"""What a scene says: sections, attachments, the grasp programme."""

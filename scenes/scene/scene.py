@@ -1,0 +1,263 @@
+"""What a scene file can say: the tree of sections, with units, defaults and ranges.
+
+Tissue coordinates are the world's x and y in metres, origin in the middle of the sheet, bed at z = 0. Angles are in
+degrees and their names say so. Nothing here touches MuJoCo.
+"""
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import ClassVar
+
+from jiggle_mj import limits
+from jiggle_mj.errors import SceneError
+from jiggle_mj.observation import Declaration
+from jiggle_mj.policies import POLICIES
+
+from .attachments import Attachment
+from .disturbance import Disturbance
+from .section import Section, choice, integer, number, points, switch, vector
+
+MOST = 20_000
+"""Vertices of a sheet."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tissue(Section):
+    """The sheet: a thin shell of St Venant-Kirchhoff material."""
+
+    section: ClassVar[str] = "tissue"
+    size: tuple[float, float] = vector((0.1, 0.1), length=2, unit="m", above=0, at_most=1)
+    """Extent in x and y [m]."""
+    thickness: float = number(1e-3, unit="m", above=0, at_most=0.02)
+    young: float = number(30e3, unit="Pa", above=0, at_most=1e9)
+    """Young's modulus [Pa]."""
+    poisson: float = number(0.45, at_least=0, below=0.5)
+    density: float = number(1000.0, unit="kg/m^3", above=0, at_most=1e5)
+    """Mass per volume [kg/m^3]."""
+    damping: float = number(0.01, unit="s", at_least=0, at_most=10)
+    """Rayleigh damping: viscous stress per elastic stress rate [s]."""
+    mesh: str = choice("unstructured", among=("equilateral", "unstructured"))
+    spacing: float = number(4.5e-3, unit="m", above=0, at_most=0.05)
+    """Edge length aimed at [m]."""
+    seed: int = integer(0, at_least=0, at_most=2**32 - 1)
+    """Draws the unstructured mesh."""
+    radius: float = number(2e-4, unit="m", above=0, at_most=5e-3)
+    """Half the thickness that contact and drawing give the sheet [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bed(Section):
+    """The plane that the tissue lies on."""
+
+    section: ClassVar[str] = "bed"
+    present: bool = switch(True)
+    friction: float = number(0.3, at_least=0, at_most=10)
+    """Coulomb coefficient between tissue and bed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tweezer(Section):
+    """The tool."""
+
+    section: ClassVar[str] = "tweezer"
+    radius: float = number(7e-3, unit="m", above=0, at_most=0.05)
+    """Vertices within this distance of the tip are held when the jaws close [m]."""
+    speed: float = number(0.15, unit="m/s", above=0, at_most=1)
+    """Of the tip while it holds tissue [m/s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Programme(Section):
+    """Grasps and lifts, one point after the other."""
+
+    section: ClassVar[str] = "programme"
+    policy: str = choice("corners", among=POLICIES)
+    """Who chooses the pulls in `run`, if nothing else is said; `corners` are the grasps below."""
+    still_frames: int = integer(20, at_least=1, at_most=1000)
+    """Frames before the first grasp, from which noise can be learned."""
+    points: tuple[tuple[float, float], ...] = points((), at_least=0)
+    """Where to grasp, tissue coordinates [m]; empty means the four corners."""
+    inset: float = number(3e-3, unit="m", at_least=0, at_most=0.05)
+    """How far inside its two edges a corner is grasped [m]."""
+    height: float = number(0.042, unit="m", above=0, at_most=0.5)
+    """Length of the lift [m]."""
+    increments: int = integer(8, at_least=1, at_most=1000)
+    lean_deg: float = number(8.0, unit="degrees", at_least=-80, at_most=80)
+    """Direction of the lift: 0 is straight up, positive leans towards the middle of the sheet."""
+    lowering: int = integer(1, at_least=0, at_most=1000)
+    """Increments back to the grasp point before the jaws open; 0 opens them at the top."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Procedure(Section):
+    """How cuts and sutures turn out."""
+
+    section: ClassVar[str] = "procedure"
+    cut_fails: float = number(0.0, at_least=0, at_most=1)
+    """Chance that a cut leaves everything as it was."""
+    suture_fails: float = number(0.0, at_least=0, at_most=1)
+    """Chance that a suture does not hold."""
+    suture_slack: float = number(0.0, unit="m", at_least=0, at_most=0.05)
+    """Length up to which the thread is loose."""
+    suture_length: float = number(0.03, unit="m", above=0, at_most=1)
+    """Of what the policy `suture` sews [m]."""
+    suture_width: float = number(7e-3, unit="m", above=0, at_most=1)
+    """Of the band that it sews [m]."""
+    suture_stiffness: float = number(1.0, unit="N/m", above=0, at_most=1e6)
+    """Of each vertex that it sews [N/m]."""
+    suture_offset: tuple[float, float, float] = vector((0.0, 0.0, 0.0), length=3, unit="m")
+    """Where a suture ends, from where its vertex lies at rest; world [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits(Section):
+    """What a policy may ask of the attachments, and where it may take the tip."""
+
+    section: ClassVar[str] = "limits"
+    energy: float = number(1e-7, unit="J", above=0, at_most=1)
+    """Mean over all particles of the energy in their attachments [J]."""
+    force: float = number(1e-2, unit="N", above=0, at_most=1e3)
+    """On any one attachment [N]."""
+    chance: float = number(0.01, above=0, below=0.5)
+    """Largest probability with which a planned step may exceed one of the two."""
+    unknown: float = number(1.0, unit="N/m", above=0, at_most=1e6)
+    """Stiffness of attachments that nobody knows of yet, as a plan reckons with them [N/m]."""
+    ceiling: float = number(0.06, unit="m", above=0, at_most=1)
+    """Greatest height of the tip above the bed [m]."""
+    beside: float = number(0.01, unit="m", above=0, at_most=1)
+    """How far beyond the resting sheet's extent the tip may go sideways [m]."""
+
+    def limits(self) -> limits.Limits:
+        """In the shared vocabulary."""
+        return limits.Limits(**{one.name: getattr(self, one.name) for one in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera(Section):
+    """The stereo pair, looking at a point from a distance, tilted about the world's x axis."""
+
+    section: ClassVar[str] = "camera"
+    width: int = integer(640, at_least=16, at_most=4096)
+    height: int = integer(480, at_least=16, at_most=4096)
+    baseline: float = number(5e-3, unit="m", above=0, at_most=0.5)
+    distance: float = number(0.14, unit="m", above=0, at_most=5)
+    """From the pair's middle to the target [m]."""
+    target: tuple[float, float, float] = vector((0.0, 0.004, 0.01), length=3, unit="m")
+    """What the pair's middle axis passes through, world [m]."""
+    tilt_deg: float = number(15.0, unit="degrees", at_least=-80, at_most=80)
+    """0 looks straight down; positive looks from the side of negative y."""
+    fov_deg: float = number(50.0, unit="degrees", above=0, below=170)
+    """Vertical field of view."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lights(Section):
+    """An even light and one lamp beside the camera; intensities in [0, 1]."""
+
+    section: ClassVar[str] = "lights"
+    ambient: float = number(0.45, at_least=0, at_most=1)
+    lamp: float = number(0.55, at_least=0, at_most=1)
+    specular: float = number(0.0, at_least=0, at_most=1)
+    """Strength of highlights on the tissue."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Texture(Section):
+    """The looks of tissue and bed, drawn from a seed."""
+
+    section: ClassVar[str] = "texture"
+    seed: int = integer(0, at_least=0, at_most=2**32 - 1)
+    contrast: float = number(1.0, at_least=0, at_most=1.5)
+    """1 is a vessel-rich membrane; 0 is a plain sheet."""
+    resolution: int = integer(1024, at_least=64, at_most=4096)
+    """Texture pixels along each side."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensing(Section):
+    """Noise of what the estimator is given."""
+
+    section: ClassVar[str] = "sensing"
+    point_sd: float = number(2e-4, unit="m", above=0, at_most=0.1)
+    """Standard deviation of each coordinate of a measured point, on its own [m]."""
+    smooth_sd: float = number(0.0, unit="m", at_least=0, at_most=0.1)
+    """Standard deviation of noise on top of that, which points near to one another share, as a tracker's do [m]."""
+    smooth_length: float = number(0.01, unit="m", above=0, at_most=1)
+    """Distance over the sheet at which that noise correlates by exp(-1/2) [m]."""
+    n_points: int = integer(600, at_least=10, at_most=100000)
+    """Tracked material points of `sensing = points`."""
+    cloud_points: int = integer(3000, at_least=10, at_most=100000)
+    """Points of each frame of `sensing = cloud`."""
+    image_sd: float = number(2.0, unit="grey levels", at_least=0, at_most=100)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Declared(Section):
+    """What the user tells the estimator before anything is seen. It may differ from the tissue."""
+
+    section: ClassVar[str] = "declared"
+    membrane_stiffness: float = number(30.0, unit="N/m", above=0)
+    poisson: float = number(0.45, at_least=0, below=0.5)
+    thickness: float = number(1e-3, unit="m", above=0)
+    areal_density: float = number(1.0, unit="kg/m^2", above=0)
+    gravity: tuple[float, float, float] = vector((0.0, 0.0, -9.81), length=3, unit="m/s^2")
+    bed: bool = switch(True)
+
+    def declaration(self) -> Declaration:
+        """In the shared vocabulary."""
+        return Declaration(
+            membrane_stiffness=self.membrane_stiffness,
+            poisson=self.poisson,
+            thickness=self.thickness,
+            areal_density=self.areal_density,
+            gravity=self.gravity,
+            bed=self.bed,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """One scene. A tissue without attachments is allowed."""
+
+    name: str
+    seed: int = 0
+    """With the seed of a run it draws the sensing noise, so that two scenes never share theirs."""
+    tissue: Tissue = field(default_factory=Tissue)
+    bed: Bed = field(default_factory=Bed)
+    attachments: tuple[Attachment, ...] = ()
+    disturbances: tuple[Disturbance, ...] = ()
+    """What nobody tells the estimator of, in the order in which they begin."""
+    secret: bool = False
+    """Whether nothing but the truth file may say that there are disturbances."""
+    tweezer: Tweezer = field(default_factory=Tweezer)
+    programme: Programme = field(default_factory=Programme)
+    procedure: Procedure = field(default_factory=Procedure)
+    limits: Limits = field(default_factory=Limits)
+    camera: Camera = field(default_factory=Camera)
+    lights: Lights = field(default_factory=Lights)
+    texture: Texture = field(default_factory=Texture)
+    sensing: Sensing = field(default_factory=Sensing)
+    declared: Declared = field(default_factory=Declared)
+
+    def __post_init__(self) -> None:
+        """Check what spans several sections."""
+        if self.tissue.spacing > min(self.tissue.size) / 4:
+            raise SceneError(
+                f"tissue.spacing = {self.tissue.spacing}: must be at most a quarter of the shorter side, "
+                f"{min(self.tissue.size) / 4:g} m."
+            )
+        n = self.tissue.size[0] * self.tissue.size[1] / (math.sqrt(0.75) * self.tissue.spacing**2)
+        if n > MOST:
+            raise SceneError(
+                f"tissue.spacing = {self.tissue.spacing} m on {self.tissue.size[0]:g} by {self.tissue.size[1]:g} m "
+                f"makes about {n:.3g} vertices; at most {MOST} are allowed. Raise spacing or make the sheet smaller."
+            )
+        for disturbance in self.disturbances:
+            disturbance.check(self.tissue.size)
+        half = tuple(side / 2 for side in self.tissue.size)
+        for x, y in self.programme.points:
+            if abs(x) > half[0] or abs(y) > half[1]:
+                raise SceneError(
+                    f"programme.points holds ({x:g}, {y:g}), off the tissue: |x| can be at most {half[0]:g} m, "
+                    f"|y| at most {half[1]:g} m."
+                )

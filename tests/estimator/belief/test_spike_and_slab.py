@@ -1,0 +1,112 @@
+"""Free or attached: odds, moments and quantiles against numerical integration."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from jiggle_mj.estimator.belief.spike_and_slab import LEARNED, Mixture, SpikeAndSlab
+
+SPIKE, RUNGS, SPREAD = 3e-3, (0.01, 0.1, 1.0), 0.5
+LOG_ODDS = -3.0
+PRIOR = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=3.0, partial=0.0)
+
+posterior = eqx.filter_jit(SpikeAndSlab.posterior)
+learned_from = eqx.filter_jit(SpikeAndSlab.learned)
+drawn_for = eqx.filter_jit(SpikeAndSlab.drawn)
+moments, quantile = eqx.filter_jit(Mixture.moments), eqx.filter_jit(Mixture.quantile)
+
+
+def density(mean: float, variance: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """A grid, the posterior on it, and the log Bayes factor."""
+    s = np.unique(np.concatenate([np.linspace(0, 1, 100_001), np.linspace(0, 0.03, 100_001)]))
+    seen = np.exp(norm.logpdf(s, mean, np.sqrt(variance)) - norm.logpdf(np.clip(mean, 0, 1), mean, np.sqrt(variance)))
+
+    def cut_off(centre: float, width: float) -> np.ndarray:
+        shape = np.exp(-0.5 * ((s - centre) / width) ** 2)
+        return shape / np.trapezoid(shape, s)
+
+    free = cut_off(0, SPIKE) * seen
+    attached = np.mean([cut_off(rung, SPREAD * rung) for rung in RUNGS], axis=0) * seen
+    odds = np.trapezoid(attached, s) / np.trapezoid(free, s)
+    whole = free + np.exp(LOG_ODDS) * attached
+    return s, whole / np.trapezoid(whole, s), float(np.log(odds))
+
+
+@pytest.mark.parametrize(
+    ("mean", "variance"),
+    [(0.02, 1e-4), (-0.05, 1e-4), (0.005, 1e-6), (0.5, 1e4), (0.9, 1e-2), (1.3, 1e-2), (0.0, 1e-6)],
+)
+def test_posterior_equals_numerical_integration(mean, variance):
+    mixture, factor = posterior(PRIOR, jnp.array([mean]), jnp.array([variance]), jnp.array([LOG_ODDS]))
+    s, p, expected_factor = density(mean, variance)
+    below = np.concatenate([[0], np.cumsum((p[1:] + p[:-1]) / 2 * np.diff(s))])
+    expected = np.trapezoid(p * s, s)
+    found, spread = (float(part[0]) for part in moments(mixture))
+    assert float(factor[0]) == pytest.approx(expected_factor, abs=1e-4)
+    assert float(mixture.attached[0]) == pytest.approx(1 / (1 + np.exp(-LOG_ODDS - expected_factor)), abs=1e-4)
+    assert found == pytest.approx(expected, rel=1e-4)
+    assert np.sqrt(spread) == pytest.approx(np.sqrt(np.trapezoid(p * (s - expected) ** 2, s)), rel=1e-3)
+    for level in (0.05, 0.5, 0.95):
+        assert float(quantile(mixture, level)[0]) == pytest.approx(np.interp(level, below, s), rel=1e-2, abs=1e-5)
+
+
+def test_far_out_in_the_tails_nothing_overflows():
+    mean, variance = jnp.array([-5.0, 0.3, 9.0]), jnp.array([1e-6, 1e-12, 1e-6])
+    mixture, factor = posterior(PRIOR, mean, variance, jnp.full(3, LOG_ODDS))
+    found, spread = moments(mixture)
+    assert np.isfinite(factor).all() and np.isfinite(spread).all()
+    np.testing.assert_allclose(found, [0, 0.3, 1], atol=1e-4)
+    np.testing.assert_allclose(quantile(mixture, 0.5), [0, 0.3, 1], atol=1e-4)
+
+
+def test_the_shares_are_those_of_the_particles_called_attached():
+    """Twenty on one rung, measured well; two free ones, one of which nothing is known, and two that are only called
+    attached because their neighbours are, count nothing."""
+    mean = jnp.array([0.1] * 20 + [0.0, 0.0, 0.5, 0.0, 0.0])
+    variance = jnp.array([1e-6] * 22 + [1e6, 1e-6, 1e-6])
+    odds = jnp.array([LOG_ODDS] * 23 + [20.0, 20.0])
+    mixture, factor = posterior(PRIOR, mean, variance, odds)
+    assert (mixture.attached[-2:] > 0.5).all()
+    learned = once = learned_from(PRIOR, mixture, factor)
+    for _ in range(100):
+        learned = learned_from(learned, mixture, factor)
+    on_it = np.asarray(mixture.weight[2, :20]).sum()
+    assert float(learned.share[1]) == pytest.approx((1 + on_it) / 23, rel=1e-6)
+    assert float(jnp.sum(learned.share)) == pytest.approx(1)
+    np.testing.assert_allclose(once.share, PRIOR.share + LEARNED * (learned.share - PRIOR.share), rtol=1e-5)
+    nobody, factor = posterior(PRIOR, jnp.zeros(4), jnp.full(4, 1e-6), jnp.full(4, LOG_ODDS))
+    np.testing.assert_allclose(learned_from(PRIOR, nobody, factor).share, 1 / 3)
+
+
+def test_a_part_of_an_attachment_is_on_the_nearest_softer_rung():
+    """A million parts, as likely as one another, of the b = s / (1 - s) of each rung."""
+    rungs = np.array([0.01, 0.1, 0.5, 0.95])
+    prior = SpikeAndSlab.build(spike=SPIKE, rungs=tuple(rungs), spread=SPREAD, even=3.0, partial=1.0)
+    parts = np.linspace(0, 1, 1_000_001)[1:]
+    logs = np.log(rungs / (1 - rungs))
+    for column, log in enumerate(logs):
+        nearest = np.argmin(np.abs(np.log(parts)[:, None] + log - logs), axis=1)
+        np.testing.assert_allclose(prior.parting[:, column], np.bincount(nearest, minlength=4) / 1e6, atol=1e-5)
+
+
+def test_the_shares_before_parting_are_learned_through_it():
+    """Particles as whole attachments on the third rung and a half of parts of such leave: what EM settles on, and what
+    draws are spread around."""
+    prior = SpikeAndSlab.build(spike=SPIKE, rungs=(0.01, 0.03, 0.1, 0.3), spread=0.1, even=1.0, partial=0.5)
+    count = np.rint(2000 * np.asarray(prior.parting[:, 2])).astype(int)
+    state = np.append(np.zeros(50, int), np.repeat(np.arange(4), count) + 1)
+    s = jnp.asarray(np.append(0.0, [0.01, 0.03, 0.1, 0.3])[state])
+    mixture, factor = posterior(prior, s, jnp.full(len(s), 1e-9), jnp.full(len(s), LOG_ODDS))
+    learned = prior
+    for _ in range(200):
+        learned = learned_from(learned, mixture, factor)
+    assert float(learned.whole[2]) > 0.98
+    np.testing.assert_allclose(learned.share, prior.parting[:, 2], atol=0.02)
+    drawn, kept = prior, []
+    for k in range(300):
+        drawn = drawn_for(drawn, jnp.asarray(state), jax.random.key(k))
+        kept.append(np.asarray(drawn.whole))
+    np.testing.assert_allclose(np.mean(kept[100:], axis=0), learned.whole, atol=0.02)

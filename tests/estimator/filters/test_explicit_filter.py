@@ -1,0 +1,145 @@
+"""The paper's filter: the textbook's formulas, missing particles, what it finds on its own simulator."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
+from jiggle_mj.estimator.filters.evidence import Evidence, Pull
+from jiggle_mj.estimator.filters.explicit import non_negative, update
+from jiggle_mj.estimator.filters.shots import History, Shots, draw_samples, predicted
+from jiggle_mj.estimator.physics.environment import Grip
+from jiggle_mj.estimator.physics.membrane import EdgeMembrane
+from jiggle_mj.estimator.physics.xpbd import XPBD, hinge_springs
+from tests.support.small_sheet import GRIP_RADIUS, equilateral, jittered
+
+MESH = jittered(equilateral(6, 6), 0.1)
+SPRINGS = (EdgeMembrane.build(MESH, stiffness=30.0), hinge_springs(MESH, stiffness=1.0))
+SIMULATOR, SWEEPS = XPBD.build(MESH, SPRINGS, areal_density=1.0, time_step=0.02), 20
+NOISE, STIFFNESS = 1e-4, 3.0
+ATTACHED = np.linalg.norm(MESH.rest, axis=1) < 9e-3
+
+
+def updated(belief: BoundaryBelief, shots: Shots, b: jax.Array | None = None) -> BoundaryBelief:
+    """Linearised at b, by default at the mean where that is not negative."""
+    return update(SIMULATOR, belief, jnp.maximum(belief.mean(), 0) if b is None else b, shots, sweeps=SWEEPS)[0]
+
+
+def shots(truth: np.ndarray, seed: int) -> list[Shots]:
+    """Six steps of 4 mm of each of four corner lifts by f itself, one sample each, with noise on what is observed."""
+    rng, samples = np.random.default_rng(seed), []
+    step = jax.jit(lambda x, grip: SIMULATOR.step(x, jnp.asarray(truth), grip, sweeps=SWEEPS))
+    for way in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+        corner = MESH.rest[np.argmax(MESH.rest[:, :2] @ np.array(way))] + 1e-3
+        grip = Grip.build(jnp.asarray(MESH.rest), jnp.asarray(corner), radius=GRIP_RADIUS, stiffness=100.0)
+        x = seen = MESH.rest
+        for height in 4e-3 * np.arange(1, 7):
+            tip = jnp.asarray(corner + np.array([0, 0, height]))
+            x = step(jnp.asarray(seen), eqx.tree_at(lambda g: g.tip, grip, tip))
+            noisy = np.asarray(x) + NOISE * rng.normal(size=x.shape)
+            samples.append(one_shot(seen, tip, grip, noisy))
+            seen = noisy
+    return samples
+
+
+def one_shot(start, tip, grip, end) -> Shots:
+    return Shots(
+        start=jnp.asarray(start)[None],
+        tip=tip[None],
+        length=grip.length[None],
+        stiffness=jnp.asarray(grip.stiffness)[None],
+        end=jnp.asarray(end)[None],
+        precision=jnp.broadcast_to(jnp.eye(3) / NOISE**2, (1, MESH.n, 3, 3)),
+    )
+
+
+def stacked(samples: list[Shots]) -> Shots:
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *samples)
+
+
+@pytest.fixture(scope="module")
+def lift() -> list[Shots]:
+    return shots(STIFFNESS * ATTACHED, 0)
+
+
+def test_an_update_is_the_papers_equations(lift):
+    """Three stacked samples against K = Sigma J^T (J Sigma J^T + V)^-1 in covariance form, J by finite differences."""
+    belief = BoundaryBelief.prior(MESH.n, mean=0.5, sd=1.0)
+    three = stacked([lift[1], lift[8], lift[5]])
+    after, _, nis = update(SIMULATOR, belief, belief.mean(), three, sweeps=SWEEPS)
+    found_mean, found_covariance = after.moments()
+
+    mean, covariance = (np.asarray(part) for part in belief.moments())
+    simulate = jax.jit(lambda b: predicted_stack(three, b).ravel())
+    h = 1e-5
+    J = np.stack([(simulate(mean + h * d) - simulate(mean - h * d)) / (2 * h) for d in np.eye(MESH.n)], axis=1)
+    S = J @ covariance @ J.T + NOISE**2 * np.eye(len(J))
+    K = covariance @ J.T @ np.linalg.inv(S)
+    innovation = np.asarray(three.end).ravel() - np.asarray(simulate(mean))
+    expected_mean = mean + K @ innovation
+    expected_covariance = (np.eye(MESH.n) - K @ J) @ covariance
+    np.testing.assert_allclose(found_mean, expected_mean, atol=1e-4)
+    np.testing.assert_allclose(found_covariance, expected_covariance, atol=1e-4)
+    np.testing.assert_allclose(nis, innovation @ np.linalg.solve(S, innovation) / len(S), rtol=1e-4)
+
+
+def predicted_stack(samples: Shots, b) -> jax.Array:
+    return jax.lax.map(lambda shot: predicted(SIMULATOR, shot, b, sweeps=SWEEPS), samples)
+
+
+def test_a_missing_particle_has_no_influence(lift):
+    belief = BoundaryBelief.prior(MESH.n, mean=0.0, sd=1.0)
+    unseen = lift[3].precision.at[0, 7].set(0.0)
+    one = eqx.tree_at(lambda s: s.precision, lift[3], unseen)
+    other = eqx.tree_at(lambda s: s.end, one, one.end.at[0, 7].add(0.3))
+    np.testing.assert_array_equal(updated(belief, one).precision, updated(belief, other).precision)
+    np.testing.assert_allclose(updated(belief, one).shift, updated(belief, other).shift, rtol=1e-12)
+
+
+def filtered(samples: list[Shots]) -> tuple[BoundaryBelief, np.ndarray]:
+    """One sample a frame, from the paper's prior mean, each linearised at the constrained mean."""
+    belief, b = BoundaryBelief.prior(MESH.n, mean=1e-4, sd=3.0), jnp.zeros(MESH.n)
+    for sample in samples:
+        belief = updated(belief, sample, b)
+        b = non_negative(belief, b)
+    return belief, np.asarray(b)
+
+
+def test_attached_particles_rank_above_all_others_on_its_own_simulator(lift):
+    """Shrunk by the prior and by noise in x_m that f ignores, so a threshold at half the truth would miss some."""
+    mean = filtered(lift)[1]
+    assert mean[ATTACHED].min() > 2 * mean[~ATTACHED].max()
+
+
+def test_what_is_seen_is_evidence_for_the_b_that_was_simulated(lift):
+    """A sheet that moves as f(b = 0) says b = 0, with no shift, also to a belief whose mean is below 0."""
+    belief, nothing = BoundaryBelief.prior(MESH.n, mean=-0.5, sd=1.0), jnp.zeros(MESH.n)
+    agreeing = eqx.tree_at(lambda shot: shot.end, lift[3], predicted_stack(lift[3], nothing))
+    after = updated(belief, agreeing, nothing)
+    assert np.diagonal(after.precision).max() > 2
+    np.testing.assert_allclose(after.shift, belief.shift, atol=1e-9 * float(after.precision.max()))
+
+
+def test_the_latest_sample_is_always_drawn_and_none_from_before_the_cut():
+    drawn = [draw_samples(5, 3, np.random.default_rng(seed)) for seed in range(50)]
+    assert all(one[-1] == 5 and len(set(one.tolist())) == 3 for one in drawn)
+    assert set(np.concatenate(drawn).tolist()) == {0, 1, 2, 3, 4, 5}
+    assert draw_samples(0, 3, np.random.default_rng(0)).tolist() == [0]
+
+    history = History(grip_stiffness=90.0, samples=3)
+    for height in (1.0, 2.0, 3.0):
+        history.add(step(height))
+    history.forget()
+    after = [history.add(step(height)) for height in (4.0, 5.0)]
+    heights = [np.asarray(one.tip)[np.asarray(one.precision).any(axis=(1, 2, 3)), 2].tolist() for one in after]
+    assert heights == [[4.0], [4.0, 5.0]]
+
+
+def step(height: float) -> Evidence:
+    """A frame that is told by the height of the tip."""
+    one, x = np.ones(MESH.n, bool), jnp.asarray(MESH.rest)
+    pull = Pull(before=x, tip=jnp.asarray([0.0, 0.0, height]), length=jnp.ones(MESH.n))
+    precision = jnp.broadcast_to(jnp.eye(3), (MESH.n, 3, 3))
+    return Evidence(y=x, precision=precision, held=jnp.asarray(one), loaded=jnp.asarray(one), pull=pull)

@@ -1,0 +1,118 @@
+"""What a frame says of the attachments: the dense formula, from free to welded, and particles that were not seen."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator.filters import force_balance
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.force_balance import DOUBT, FAINT, LEAST, ForceBalance
+from tests.support.small_sheet import DECLARATION, attached, dense, lifts, sheet, sheet_balance, sheet_energy
+from tests.support.small_sheet import observed as evidence
+
+K = DECLARATION.membrane_stiffness
+FORCE_SD, FORCE_LEVEL, ANCHOR_SD = 1e-4, 24e-3, 1e-4
+N = sheet().n
+
+
+@eqx.filter_jit
+def information(balance: ForceBalance, x, s, evidence: Evidence):
+    frame = balance.linearise(x, s, evidence)
+    return balance.information(frame, balance.fit(frame))
+
+
+@pytest.fixture
+def balance() -> ForceBalance:
+    return sheet_balance(FORCE_SD, FORCE_LEVEL)
+
+
+def test_information_equals_the_dense_formula(balance):
+    """D^T N^-1 D, -D^T N^-1 e and e^T N^-1 e over particles that are not held, with N = V + H R H^T written out.
+
+    tau grows, from FORCE_SD, with the sum of what the elements around a particle pull at it. D is shrunk by a multiple
+    of the share that the covariance of x given all that was seen makes up.
+    """
+    frame = lifts()[3]
+    seen, x = evidence(frame, 1), frame.x
+    s = np.random.default_rng(0).uniform(0, 1, N)
+    s[:5] = 1
+    found = information(balance, jnp.asarray(x), jnp.asarray(s), seen)
+
+    free, each = np.repeat(~frame.held, 3), np.repeat(s, 3)
+    internal = np.asarray(eqx.filter_jit(sheet_energy().internal_gradient)(jnp.asarray(x)))
+    stiff = dense(sheet_energy().layout, eqx.filter_jit(sheet_energy().hessian)(jnp.asarray(x), jnp.zeros(N)))
+    d = x - sheet().rest
+    H = (1 - each)[:, None] * stiff + np.diag(each * K)
+    R = np.zeros((3 * N, 3 * N))
+    D = np.zeros((3 * N, N))
+    for i in range(N):
+        R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = np.linalg.inv(np.asarray(seen.precision)[i] + FAINT * np.eye(3))
+        D[3 * i : 3 * i + 3, i] = K * d[i] - internal[i]
+    flow = np.zeros(N)
+    for term in sheet_energy().terms:
+        forces = np.asarray(eqx.filter_jit(term.gradient)(jnp.asarray(x[np.asarray(term.vertices)])))
+        np.add.at(flow, np.asarray(term.vertices), np.linalg.norm(forces, axis=2))
+    tau = np.sqrt(FORCE_SD**2 + (FORCE_SD / LEAST * flow / FORCE_LEVEL) ** 2)
+    assert tau.max() > 1.3 * tau.min()
+    V = np.diag(((1 - each) * np.repeat(tau, 3)) ** 2 + (each * K * ANCHOR_SD) ** 2)
+    W = np.where(free, 1 / np.diagonal(V), 0)
+    covariance = np.linalg.inv(np.linalg.inv(R) + H.T @ (W[:, None] * H))
+    turn = K * np.eye(3 * N) - stiff
+    error = np.diagonal(turn @ covariance @ turn.T).reshape(N, 3).sum(axis=1)
+    D *= np.maximum(1 - DOUBT * error / np.sum(D**2, axis=0), 0)
+    e = ((1 - each) * internal.ravel() + each * K * d.ravel() + H @ (np.asarray(seen.y) - x).ravel())[free]
+    D, N_inverse = D[free], np.linalg.inv((V + H @ R @ H.T)[np.ix_(free, free)])
+    expected = D.T @ N_inverse @ D
+    np.testing.assert_allclose(found.precision, expected, atol=1e-7 * np.abs(expected).max())
+    pulled = -D.T @ N_inverse @ e
+    np.testing.assert_allclose(found.pulled, pulled, atol=1e-6 * np.abs(pulled).max())
+    np.testing.assert_allclose(found.squared, e @ N_inverse @ e, rtol=1e-6)
+    np.testing.assert_allclose(found.shift, pulled + expected @ s, atol=1e-6 * np.abs(expected @ s).max())
+
+
+def test_the_slope_is_the_derivative_of_the_balance(balance):
+    frame = lifts()[3]
+    seen, x = evidence(frame, 1), jnp.asarray(frame.x)
+    s, step = jnp.asarray(np.random.default_rng(1).uniform(0, 1, N)), 1e-6
+    linearised = eqx.filter_jit(balance.linearise)
+    ahead, behind, here = (linearised(x, s + move, seen) for move in (step, -step, 0.0))
+    difference = (ahead.unbalanced - behind.unbalanced) / (2 * step)
+    np.testing.assert_allclose(here.slope, difference, atol=1e-8)
+
+
+def test_at_a_weld_the_reaction_force_shows(balance):
+    """A welded particle at the rim does not move; one frame gives its s a standard deviation of 0.2 all the same."""
+    frame, s = lifts(np.inf)[7], jnp.asarray(attached().astype(float))
+    moved = np.linalg.norm(frame.x - sheet().rest, axis=1)
+    assert moved[attached()].max() < 1e-5
+    found = information(balance, jnp.asarray(frame.x), s, evidence(frame, 2))
+    assert np.diagonal(found.precision)[attached()].max() > 1 / 0.2**2
+
+
+def test_twenty_frames_in_which_nothing_moved_leave_s_unknown(balance):
+    """All slopes are then error, and what chance leaves of them must not add up: an s in [0, 1] has 0.29 by itself."""
+    frame = lifts()[0]
+    np.testing.assert_array_equal(frame.x, sheet().rest)
+    search = eqx.filter_jit(lambda seen: balance.approach(seen.y, jnp.zeros(N), seen).x)
+    seen = [evidence(frame, seed) for seed in range(20)]
+    found = [information(balance, search(one), jnp.zeros(N), one).precision for one in seen]
+    assert np.median(np.sum([np.diagonal(one) for one in found], axis=0)[~frame.held]) < 1 / 0.5**2
+
+
+def test_a_search_that_is_cut_off_says_so(balance, monkeypatch):
+    """From what was seen, crumpled by its noise, it takes several steps; one is not enough."""
+    seen, s = evidence(lifts()[3], 3), jnp.zeros(N)
+    search = eqx.filter_jit(lambda: balance.approach(seen.y, s, seen).converged)
+    assert search()
+    monkeypatch.setattr(force_balance, "STATE_STEPS", 1)
+    cut_off = eqx.filter_jit(lambda: balance.approach(seen.y, s, seen).converged)
+    assert not cut_off()
+
+
+def test_evidence_only_sharpens(balance):
+    """Each frame's information is positive semi-definite."""
+    frame = lifts()[3]
+    found = information(balance, jnp.asarray(frame.x), jnp.zeros(N), evidence(frame, 3))
+    values = np.linalg.eigvalsh(np.asarray(found.precision))
+    assert values.min() > -1e-9 * values.max() and values.max() > 1e3

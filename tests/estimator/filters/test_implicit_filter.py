@@ -1,0 +1,131 @@
+"""The implicit filter on its own engine: attachments from soft to welded, honest uncertainty, missing particles."""
+
+from functools import cache
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.eval.metrics.detection import dilate
+from tests.support.small_sheet import (
+    STIFFNESS,
+    Lift,
+    attached,
+    follow,
+    lifts,
+    nees,
+    observed,
+    sheet,
+    sheet_balance,
+    sheet_prior,
+)
+
+FORCE_SD = 1e-4
+"""[N]; small, as the data come from the filter's own model."""
+SOFT_TO_RIGID = (STIFFNESS, pytest.param(10 * STIFFNESS, marks=pytest.mark.slow), np.inf)
+"""0.1 and 1 times the membrane stiffness, and a weld [N/m]."""
+SEEDS = range(3)
+
+
+def implicit() -> ImplicitFilter:
+    return ImplicitFilter(sheet_balance(FORCE_SD))
+
+
+def run(frames: tuple[Lift, ...], seed: int):
+    """All lifts; the last update, and what is stated at the end."""
+    return follow(implicit(), frames, [observed(frame, 100 * seed + k) for k, frame in enumerate(frames)])
+
+
+@cache
+def runs(stiffness: float) -> list[Any]:
+    """Several seeds: what is held rigidly shows itself in some more than in others."""
+    return [run(lifts(stiffness), seed) for seed in SEEDS]
+
+
+@pytest.mark.parametrize("stiffness", SOFT_TO_RIGID)
+def test_the_attached_particles_are_found_and_no_others(stiffness):
+    """Four corner lifts with 0.1 mm of noise. Particles inside a stiff patch bear no load: nothing can show them.
+
+    Beside a weld hardly anything moves, so that single neighbours may pass for held, and some of its rim may not.
+    """
+    probability, around = np.array([said.probability for _, said in runs(stiffness)]), rim()
+    found = probability > 0.5
+    assert found[:, around].mean() >= (0.9 if stiffness <= STIFFNESS else 0.6)
+    assert probability[:, around].mean() > 0.6
+    assert not (found & ~dilate(attached(), sheet().faces, 1)).any()
+    if stiffness <= STIFFNESS:
+        assert ((found != attached()).sum(axis=1) <= 1).all()
+
+
+def rim() -> np.ndarray:
+    """Attached particles with a free neighbour."""
+    edges, held = sheet().edges, attached()
+    mixed = edges[held[edges].sum(axis=1) == 1]
+    return held & np.isin(np.arange(sheet().n), mixed)
+
+
+@pytest.mark.parametrize("stiffness", SOFT_TO_RIGID)
+def test_intervals_hold_the_truth(stiffness):
+    """Nine tenths are stated, over all particles; most of those of a weld are open-ended."""
+    lower, upper = np.moveaxis([said.belief.interval() for _, said in runs(stiffness)], 1, 0)
+    truth = np.where(attached(), stiffness, 0.0)
+    holds = (lower <= truth) & (truth <= upper)
+    assert holds.mean() >= 0.9
+    assert np.isinf(upper[:, attached()]).mean() > 0.5 or np.isfinite(stiffness)
+
+
+def test_a_free_sheet_has_no_attachment():
+    for seed in range(2):
+        _, said = run(lifts(0.0), seed)
+        assert not (np.asarray(said.probability) > 0.5).any()
+
+
+def test_errors_are_as_large_as_stated():
+    """NEES per degree of freedom of s where the truth is no bound of it."""
+    assert 0.3 < np.mean([nees(said.belief) for _, said in runs(STIFFNESS)]) < 2
+
+
+@pytest.mark.parametrize("stiffness", SOFT_TO_RIGID)
+def test_innovations_are_as_large_as_stated(stiffness):
+    assert all(0.5 < float(out.nis) < 1.5 for out, _ in runs(stiffness))
+
+
+def test_the_state_is_closer_to_the_truth_than_what_was_seen():
+    """The sheet's physics filters the noise."""
+    frame, filter = lifts()[3], implicit()
+    seen = observed(frame, 5)
+    out = filter.update(sheet_prior(), jnp.asarray(STIFFNESS * attached()), seen, seen.y)
+    free = ~frame.held
+    rms = [np.sqrt(np.mean((np.asarray(x) - frame.x)[free] ** 2)) for x in (out.x, seen.y)]
+    assert rms[0] < 0.8 * rms[1]
+
+
+def test_a_missing_particle_has_no_influence():
+    """Whatever stands in y where the precision is zero, the outcome is the same."""
+    frame = lifts()[3]
+    unseen = np.zeros(sheet().n, bool)
+    unseen[[3, 20, 44, 60]] = True
+    seen = observed(frame, 2, unseen)
+    other = Evidence(
+        y=jnp.where(jnp.asarray(unseen)[:, None], seen.y + 0.3, seen.y),
+        precision=seen.precision,
+        held=seen.held,
+        loaded=seen.loaded,
+    )
+    outs = []
+    for one in (seen, other):
+        filter = implicit()
+        outs.append(filter.update(sheet_prior(), jnp.zeros(sheet().n), one, jnp.asarray(frame.x)))
+    for name in ("x", "b", "nis", "probability"):
+        np.testing.assert_array_equal(getattr(outs[0], name), getattr(outs[1], name))
+
+
+def test_a_release_without_a_frame_since_the_last_changes_nothing():
+    frame, filter = lifts()[3], implicit()
+    seen = observed(frame, 5)
+    out = filter.update(sheet_prior(), jnp.zeros(sheet().n), seen, seen.y)
+    stated = filter.release(out.belief)
+    assert filter.release(stated.belief) is None

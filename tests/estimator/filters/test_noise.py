@@ -1,0 +1,108 @@
+"""Noise learned from what is left unexplained: kept where it is right, widened where it is not."""
+
+from functools import reduce
+from operator import add
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator.filters.evidence import Stated
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.estimator.filters.noise import Misfit, Noise
+from tests.support.small_sheet import NOISE, attached, follow, lifts, observed, sheet_balance
+
+FORCE_SD = 1e-3
+DRAWS = 60
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[Misfit]:
+    """Of frames whose errors are drawn from the model, linear around a lifted state with half of s rigid."""
+    balance, truth = sheet_balance(FORCE_SD), lifts()[3]
+    seen, s = observed(truth, 0), jnp.asarray(0.5 * attached())
+    frame = eqx.filter_jit(balance.linearise)(jnp.asarray(truth.x), s, seen)
+
+    @eqx.filter_jit
+    def misfit(balance: ForceBalance, draw: jax.Array) -> Misfit:
+        own, others = jax.random.normal(draw, (2, *frame.x.shape))
+        sd = jnp.where(frame.weight > 0, 1 / jnp.sqrt(frame.weight), 0.0)
+        seen_sd = 1 / jnp.sqrt(seen.precision[:, 0, 0])
+        parts = sd[:, None] * own, seen_sd[:, None] * others
+        off_balance = eqx.tree_at(lambda one: (one.unbalanced, one.off), frame, parts)
+        return balance.misfit(off_balance, balance.fit(off_balance), seen)
+
+    return [misfit(balance, key) for key in jax.random.split(jax.random.key(0), DRAWS)]
+
+
+def test_squares_equal_the_degrees_of_freedom_where_the_noise_is_right(drawn):
+    """Forces and positions apart, over single frames and over sums of them; four standard errors."""
+    for name in ("force", "position"):
+        ratio = [float(jnp.sum(getattr(one, name) ** 2) / getattr(one, f"{name}_degrees")) for one in drawn]
+        assert np.mean(ratio) == pytest.approx(1, abs=4 * np.std(ratio) / np.sqrt(DRAWS)), name
+        assert np.std(ratio) < 0.3, name
+    together = reduce(add, drawn)
+    assert float(jnp.sum(together.force**2) / together.force_degrees) == pytest.approx(1, abs=0.3)
+    assert Noise().learned(drawn) == Noise()
+
+
+def test_an_error_that_persists_counts_by_its_sum(drawn):
+    """Ten frames with one and the same error are worth one of them, not ten."""
+    persistent = reduce(add, [drawn[0]] * 10)
+    single = float(jnp.sum(drawn[0].force ** 2) / drawn[0].force_degrees)
+    assert Noise().learned([persistent]).force == pytest.approx(10 * single)
+
+
+def test_noise_is_never_narrower_than_typed_and_keeps_still_about_right(drawn):
+    tenth = 0.1 * drawn[0].force, 0.1 * drawn[0].position
+    small = eqx.tree_at(lambda one: (one.force, one.position), drawn[0], tenth)
+    assert Noise().learned([small]) == Noise()
+    assert Noise(force=4.0, position=9.0).learned([small]) == Noise()
+    assert Noise(force=4.0, position=9.0).learned(drawn) == Noise(force=4.0, position=9.0)
+
+
+@pytest.fixture(scope="module")
+def runs() -> dict[int, tuple[Noise, Stated]]:
+    return {times: run(times) for times in (1, 4)}
+
+
+@pytest.mark.parametrize("times", [1, 4])
+def test_the_filter_finds_how_noisy_positions_are(runs, times):
+    noise, stated = runs[times]
+    assert stated.converged
+    assert noise.position == pytest.approx(times**2, rel=0.2)
+
+
+def test_positions_noisier_than_stated_do_not_make_the_filter_report_what_is_not_there(runs, monkeypatch):
+    """It misses what it can no longer see; without learning it reports free particles too, and is surer than right."""
+    _, learned = runs[4]
+    monkeypatch.setattr(Noise, "learned", lambda noise, _: noise)
+    _, typed = run(4)
+    wrong = [int((found(one) & ~attached()).sum()) for one in (learned, typed)]
+    assert wrong[0] == 0 < wrong[1]
+    assert surprise(learned) < 0.6 * surprise(typed)
+
+
+def run(times: float) -> tuple[Noise, Stated]:
+    """All lifts, with that many times the stated noise."""
+    filter, rng = ImplicitFilter(sheet_balance(1e-4)), np.random.default_rng(1)
+    noisy = [frame.x + times * NOISE * rng.normal(size=frame.x.shape) for frame in lifts()]
+    seen = [
+        eqx.tree_at(lambda one: one.y, observed(frame, 0), jnp.asarray(y))
+        for frame, y in zip(lifts(), noisy, strict=True)
+    ]
+    _, stated = follow(filter, lifts(), seen)
+    return filter.noise, stated
+
+
+def found(stated: Stated) -> np.ndarray:
+    return np.asarray(stated.probability) > 0.5
+
+
+def surprise(stated: Stated) -> float:
+    """Mean negative logarithm of what P(attached) says of the truth [nat]."""
+    of_truth = np.where(attached(), stated.probability, 1 - np.asarray(stated.probability))
+    return float(-np.mean(np.log(of_truth)))

@@ -1,0 +1,63 @@
+"""The tracker of measured points: what it says of the noise of a declared mesh, from frames at rest."""
+
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator.perception import PointTracker
+from jiggle_mj.observation import DeclaredMesh, MeasuredPoints
+from tests.support.small_sheet import sheet
+
+SD = 2e-4
+
+
+def points(positions, ids=None):
+    return MeasuredPoints(positions=positions, track_id=np.arange(sheet().n) if ids is None else ids, sd=SD)
+
+
+def variance(mesh, still):
+    """Of a coordinate of a frame, its own noise and the mesh's."""
+    tracker = PointTracker(DeclaredMesh(vertices=mesh, faces=sheet().faces, track_id=np.arange(sheet().n)))
+    tracker.start(still)
+    return tracker.track(points(sheet().rest)).covariance[0, 0, 0]
+
+
+def noisy(seed):
+    return sheet().rest + SD * np.random.default_rng(seed).normal(size=(sheet().n, 3))
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_an_exact_mesh_adds_no_noise_and_a_measured_one_its_own(frames):
+    """As far as the still frames tell, which is to some tens of per cent of a frame's variance."""
+    still = [points(noisy(seed)) for seed in range(frames)]
+    assert variance(sheet().rest, still) == pytest.approx(SD**2, rel=0.3)
+    assert variance(noisy(9), still) == pytest.approx(2 * SD**2, rel=0.3)
+
+
+def test_a_mesh_that_is_a_frame_itself_has_that_frames_noise():
+    first = noisy(0)
+    assert variance(first, [points(first)]) == pytest.approx(2 * SD**2)
+    assert variance(first, [points(first), points(noisy(1))]) == pytest.approx(2 * SD**2)
+
+
+def test_a_mesh_that_no_frame_shows_is_taken_to_have_a_frames_noise():
+    elsewhere = points(sheet().rest, ids=np.arange(sheet().n) + 1000)
+    assert variance(sheet().rest, [elsewhere]) == pytest.approx(2 * SD**2)
+
+
+def test_a_mesh_that_is_far_off_is_not_taken_to_be_worse_than_a_frame():
+    """A shift of the whole sheet is no noise of its rest shape."""
+    assert variance(sheet().rest + 0.01, [points(noisy(0))]) == pytest.approx(2 * SD**2)
+
+
+def test_frames_in_which_the_sheet_has_moved_already_do_not_count_as_rest():
+    still = [points(noisy(seed)) for seed in range(18)] + [points(noisy(seed) + 2e-3) for seed in (18, 19)]
+    rest = PointTracker().start(still).rest
+    np.testing.assert_array_equal(rest, PointTracker().start(still[:18]).rest)
+    assert np.abs(np.mean(rest - sheet().rest, axis=0)).max() < SD / 10
+
+
+def test_frames_that_differ_by_noise_alone_or_half_of_the_time_all_count():
+    alike = [points(noisy(seed)) for seed in range(20)]
+    np.testing.assert_allclose(PointTracker().start(alike).rest, np.mean([one.positions for one in alike], axis=0))
+    halved = alike[:10] + [points(noisy(seed) + 2e-3) for seed in range(10)]
+    assert np.mean(PointTracker().start(halved).rest - sheet().rest) == pytest.approx(1e-3, rel=0.05)

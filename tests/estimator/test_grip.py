@@ -1,0 +1,36 @@
+"""What the jaws hold goes and turns with the tool."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jiggle_mj.errors import PerceptionError
+from jiggle_mj.estimator.grip import GripHold
+from jiggle_mj.observation import ToolState
+
+POINTS = np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.02, 0.0, 0.0]])
+
+
+def tool(*, position=(0.0, 0.0, 1e-3), turn=(0.0, 0.0, 0.0)) -> ToolState:
+    quat_wxyz = Rotation.from_rotvec(turn).as_quat(scalar_first=True)
+    return ToolState(position=np.array(position), quat_wxyz=quat_wxyz, closed=True, grasp=1, radius=3e-3)
+
+
+def test_what_is_within_reach_is_held_and_follows_the_tool():
+    hold = GripHold.close(tool(turn=(0.3, 0.0, 0.0)), POINTS, None)
+    np.testing.assert_array_equal(hold.held, [True, True, False])
+    moved = hold.expected(tool(position=(0.0, 0.01, 0.0), turn=(0.3, 0.0, 0.0)))
+    np.testing.assert_allclose(moved, POINTS + np.array([0.0, 0.01, -1e-3]), atol=1e-15)
+
+
+def test_it_turns_about_the_tip_by_as_much_as_the_tool_since_the_jaws_closed():
+    before = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])
+    after = Rotation.from_rotvec([0.0, np.pi / 2, 0.0]) * before
+    hold = GripHold.close(tool(turn=before.as_rotvec()), POINTS, None)
+    turned = hold.turned(tool(turn=after.as_rotvec()))
+    np.testing.assert_allclose(turned[1], [-1e-3, 0.0, 0.0], atol=1e-15)  # about y: x to -z, and the tip is 1 mm above
+
+
+def test_jaws_that_close_on_nothing_are_refused():
+    with pytest.raises(PerceptionError, match=r"grasp 1 is off the tissue.*9\.0 mm from the nearest"):
+        GripHold.close(tool(position=(0.0, 0.0, 9e-3)), POINTS, None)

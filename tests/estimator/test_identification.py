@@ -1,0 +1,105 @@
+"""Weight and bending relative to the membrane, found with the attachments unknown; and refused where nothing tells."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator import Estimator
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.estimator.identification import identify
+from jiggle_mj.estimator.physics.ratios import ratios, scaled
+from jiggle_mj.estimator.physics.surrogate import surrogate
+from jiggle_mj.material import DOUBTFUL, material
+from tests.support.small_sheet import DECLARATION, attached, follow, lifts, observed, sheet, sheet_balance, sheet_energy
+
+WEIGHT, BENDING = 0.6, 1.7
+"""What is declared, times the truth."""
+SEEDS = range(2)
+
+
+def declared() -> np.ndarray:
+    """Log factors of the truth on what is declared."""
+    return -np.log([WEIGHT, BENDING])
+
+
+def test_scaling_is_building_from_another_declaration():
+    """Forces of both, at a state with every term at work."""
+    other = replace(DECLARATION, areal_density=WEIGHT, thickness=DECLARATION.thickness * BENDING**0.5)
+    x = jnp.asarray(lifts()[2].x)
+    found = scaled(sheet_energy(), jnp.log(jnp.array([WEIGHT, BENDING]))).internal_gradient(x)
+    expected = surrogate(sheet(), other).internal_gradient(x)
+    np.testing.assert_allclose(found, expected, atol=1e-12 * float(jnp.abs(expected).max()))
+    assert float(jnp.abs(found - sheet_energy().internal_gradient(x)).max()) > 1e-4
+
+
+def test_a_sheet_without_gravity_has_no_weight():
+    assert ratios(surrogate(sheet(), replace(DECLARATION, gravity=(0.0, 0.0, 0.0)))) == ("bending",)
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[tuple]:
+    """Four lifts of a sheet that is declared too light and too stiff to bend."""
+    wrong = scaled(sheet_energy(), jnp.log(jnp.array([WEIGHT, BENDING])))
+    found = []
+    for seed in SEEDS:
+        filter = ImplicitFilter(sheet_balance(1e-4).of(wrong))
+        seen = [observed(frame, 100 * seed + i) for i, frame in enumerate(lifts())]
+        _, stated = follow(filter, lifts(), seen)
+        found.append(identify(filter, stated.belief, stated.b, on_pass=lambda _: None))
+    return found
+
+
+@pytest.mark.slow
+def test_the_truth_is_found_within_its_standard_errors(runs):
+    """Also in the mean over the seeds, where a bias would show."""
+    scores = np.array(
+        [
+            [(np.log(factors[name]) - true) / log_sd[name] for name, true in zip(factors, declared(), strict=True)]
+            for factors, log_sd, _, converged in runs
+            if converged
+        ]
+    )
+    assert len(scores) == len(SEEDS)
+    assert (np.abs(scores) < 3.5).all()
+    assert (np.abs(scores.mean(axis=0)) < 3 / np.sqrt(len(SEEDS))).all()
+
+
+@pytest.mark.slow
+def test_standard_errors_say_something(runs):
+    assert all(log_sd["weight"] < 0.1 and log_sd["bending"] < DOUBTFUL for _, log_sd, _, _ in runs)
+
+
+@pytest.mark.slow
+def test_the_attachments_are_found_with_the_right_sheet(runs):
+    for _, _, stated, _ in runs:
+        found = np.asarray(stated.probability) > 0.5
+        assert (found == attached()).mean() > 0.95
+
+
+@pytest.mark.slow
+def test_frames_at_rest_say_nothing():
+    """The first of each lift, where nothing has moved yet."""
+    filter, frames = ImplicitFilter(sheet_balance(1e-4)), lifts()[::4]
+    _, stated = follow(filter, frames, [observed(frame, i) for i, frame in enumerate(frames)])
+    factors, log_sd, _, converged = identify(filter, stated.belief, stated.b, on_pass=lambda _: None)
+    found = material(DECLARATION, factors, log_sd, converged=converged)
+    assert set(found.refused) == {"weight", "bending", "membrane stiffness"}
+    assert found.declaration == DECLARATION
+
+
+def test_what_is_found_becomes_a_declaration():
+    found = material(DECLARATION, {"weight": 0.5, "bending": 4.0}, {"weight": 0.02, "bending": 0.1}, converged=True)
+    assert set(found.refused) == {"membrane stiffness"}
+    assert found.declaration.membrane_stiffness == pytest.approx(2 * DECLARATION.membrane_stiffness)
+    assert found.declaration.thickness == pytest.approx(2 * DECLARATION.thickness)
+    doubtful = material(DECLARATION, {"weight": 0.5, "bending": 4.0}, {"weight": 0.02, "bending": 0.5}, converged=True)
+    assert set(doubtful.refused) == {"bending", "membrane stiffness"}
+    assert doubtful.declaration.thickness == DECLARATION.thickness
+    assert "2.7" in doubtful.refused["bending"]
+
+
+def test_nothing_is_identified_before_the_first_grasp():
+    with pytest.raises(ValueError, match="before the first frame"):
+        Estimator(DECLARATION).identify()

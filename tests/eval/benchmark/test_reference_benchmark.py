@@ -1,0 +1,31 @@
+"""The reference's benchmark: what it prints."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jiggle_mj.eval.benchmark import reference_benchmark as bench
+from jiggle_mj.scenes.tissue.model import build_tissue
+
+
+@pytest.mark.render
+def test_it_times_increments_pairs_and_an_episode(monkeypatch):
+    """On small meshes; the whole episode of the shipped scene is left to the benchmark itself."""
+    small = bench.sized(60)
+    monkeypatch.setattr(bench, "load_scene", lambda name: small)
+    monkeypatch.setattr(bench, "PAIRS", 3)
+    metrics = bench.reference_benchmark((60, 120), say=lambda _: None)
+    small_one, large, slope = (
+        float(metrics[f"reference_increment_{end}"]["value"]) for end in ("n60_s", "n120_s", "exponent")
+    )
+    assert slope == pytest.approx(np.log(large / small_one) / np.log(2))
+    assert 3 <= float(metrics["reference_increment_n60_steps"]["value"]) < 100
+    assert float(metrics["reference_episode_s"]["value"]) > 8 * small_one
+    assert 0 < float(metrics["stereo_pair_s"]["value"]) < 5
+    json.dumps(metrics, allow_nan=False)
+
+
+def test_sizes_are_about_what_was_asked():
+    for n in (300, 625):
+        assert len(build_tissue(bench.sized(n), drawn=False).sheet.vertices) == pytest.approx(n, rel=0.05)

@@ -1,0 +1,219 @@
+"""A small sheet that several tests share, so that JAX compiles its shapes once, and lifts of it by our own engine."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jiggle_mj.estimate import Belief
+from jiggle_mj.estimator.belief.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, centred, undisturbed
+from jiggle_mj.estimator.filters.evidence import Evidence, Stated, Update
+from jiggle_mj.estimator.filters.force_balance import LEAST, ForceBalance
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
+from jiggle_mj.estimator.physics.block_tridiagonal import BlockTridiagonal, Layout
+from jiggle_mj.estimator.physics.energy import SheetEnergy
+from jiggle_mj.estimator.physics.environment import Grip
+from jiggle_mj.estimator.physics.equilibrium import equilibrium
+from jiggle_mj.estimator.physics.mesh import SheetMesh
+from jiggle_mj.estimator.physics.surrogate import surrogate
+from jiggle_mj.eval.benchmark import estimator_benchmark as benchmark
+from jiggle_mj.eval.metrics.calibration import nees_per_dof
+from jiggle_mj.observation import Declaration
+
+SPACING = 7e-3
+DECLARATION = Declaration()
+STIFFNESS = 3.0
+"""Of each attached particle [N/m], a tenth of the membrane's."""
+GRIP_RADIUS = 8e-3
+STOOD = (np.zeros(1), np.zeros((1, 3)))
+"""When the tool reported [s], and how far it had gone [m]."""
+FORCE_TOLERANCE = 1e-8
+"""[N]; the weight of one particle is 4e-4."""
+
+WELD = 1e6
+"""[N/m]."""
+NOISE, GRIP_SD = 1e-4, 1.5e-3
+"""Standard deviations of what is seen of a particle, and of a held one [m]."""
+
+search = eqx.filter_jit(equilibrium)
+
+
+def equilateral(columns: int, rows: int, spacing: float = SPACING) -> SheetMesh:
+    """The benchmark's, at this file's spacing."""
+    return benchmark.equilateral(columns, rows, spacing)
+
+
+def jittered(mesh: SheetMesh, share: float, seed: int = 0) -> SheetMesh:
+    """The same triangles with every particle moved in the plane by up to `share` of the spacing."""
+    move = np.random.default_rng(seed).uniform(-share, share, (mesh.n, 2)) * mesh.spacing
+    return SheetMesh(mesh.rest + np.column_stack([move, np.zeros(mesh.n)]), mesh.faces)
+
+
+def dense(layout: Layout, matrix: BlockTridiagonal) -> np.ndarray:
+    """The 3n x 3n matrix in particle order."""
+    nb, m = matrix.diagonal.shape[:2]
+    whole = np.zeros((nb * m, nb * m))
+    for k in range(nb):
+        whole[k * m : (k + 1) * m, k * m : (k + 1) * m] = matrix.diagonal[k]
+    for k in range(nb - 1):
+        whole[(k + 1) * m : (k + 2) * m, k * m : (k + 1) * m] = matrix.lower[k]
+        whole[k * m : (k + 1) * m, (k + 1) * m : (k + 2) * m] = np.asarray(matrix.lower[k]).T
+    rows = (3 * np.asarray(layout.slot)[:, None] + np.arange(3)).ravel()
+    return whole[np.ix_(rows, rows)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lift:
+    """One frame of a lifted sheet, without noise."""
+
+    x: np.ndarray
+    tip: np.ndarray
+    held: np.ndarray
+    grasp: int
+
+
+@cache
+def sheet() -> SheetMesh:
+    """81 particles, 60 mm x 48 mm, slightly irregular."""
+    return jittered(equilateral(9, 9), 0.1)
+
+
+@cache
+def sheet_energy() -> SheetEnergy:
+    """Membrane, bending, weight and bed."""
+    return surrogate(sheet(), DECLARATION)
+
+
+@cache
+def sheet_balance(force_sd: float, force_level: float = np.inf) -> ForceBalance:
+    """What the implicit filter linearises; both [N]. Of data of its own model on its own mesh no share is wrong."""
+    k = DECLARATION.membrane_stiffness
+    return ForceBalance.build(
+        sheet(),
+        sheet_energy(),
+        reference=k,
+        force_sd=force_sd / LEAST,
+        force_level=force_level,
+        anchor_sd=1e-4,
+        grip_stiffness=3 * k,
+    )
+
+
+@cache
+def sheet_prior() -> AttachmentBelief:
+    """The implicit filter's."""
+    return prior_belief(sheet(), reference=DECLARATION.membrane_stiffness)
+
+
+def at_rest(
+    mesh: SheetMesh,
+    declared: Declaration,
+    *,
+    at: float = 0.0,
+    times: np.ndarray = STOOD[0],
+    ways: np.ndarray = STOOD[1],
+) -> tuple[SheetModel, Moment]:
+    """A sheet's model without effects, and a moment when it lies as ever, whatever the tool says."""
+    x = jnp.asarray(mesh.rest)
+    model = SheetModel(energy=undisturbed(mesh, declared), tool=jnp.zeros(3), view=centred(mesh), time=jnp.asarray(at))
+    moment = Moment(
+        rest=x,
+        time=jnp.asarray(at),
+        gap=jnp.asarray(0.1),
+        earlier_gap=jnp.asarray(0.1),
+        closed=jnp.asarray(at),
+        now=x,
+        before=x,
+        earlier=x,
+        report_times=jnp.asarray(times),
+        reports=jnp.asarray(ways),
+        past=x[None],
+        began=jnp.zeros(1),
+        ended=jnp.zeros(1),
+    )
+    return model, moment
+
+
+def gripped(energy: SheetEnergy, x: np.ndarray, corner: np.ndarray, tip: np.ndarray) -> SheetEnergy:
+    """The energy with jaws that closed at a corner around particles at x, the tip moved since."""
+    grip = Grip.build(jnp.asarray(x), jnp.asarray(corner), radius=GRIP_RADIUS, stiffness=100.0)
+    grip = eqx.tree_at(lambda g: g.tip, grip, jnp.asarray(tip))
+    return SheetEnergy.build(np.asarray(energy.rest), (*energy.terms, grip), energy.layout)
+
+
+def attached() -> np.ndarray:
+    """A disc in the middle."""
+    return np.linalg.norm(sheet().rest, axis=1) < 11e-3
+
+
+def corners() -> list[np.ndarray]:
+    """Where the jaws close [m]."""
+    flat = sheet().rest[:, :2]
+    return [sheet().rest[np.argmax(flat @ np.array(way))] + 1e-3 for way in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+
+
+@cache
+def lifts(stiffness: float = STIFFNESS) -> tuple[Lift, ...]:
+    """Three frames of each of four corner lifts, the attached particles on springs of the given stiffness.
+
+    Infinity is a weld: a spring so stiff that nothing moves by a micrometre.
+    """
+    energy, b = sheet_energy(), jnp.asarray(min(stiffness, WELD) * attached())
+    frames = []
+    for grasp, corner in enumerate(corners(), start=1):
+        x = sheet().rest
+        held = np.linalg.norm(x - corner, axis=1) <= GRIP_RADIUS
+        for height in (0.0, 6e-3, 12e-3, 18e-3):
+            tip = corner + np.array([0.0, 0.0, height]) - 0.3 * height * corner / np.linalg.norm(corner)
+            found = search(gripped(energy, sheet().rest, corner, tip), b, jnp.asarray(x))
+            assert found.converged, (grasp, height, found.force)
+            x = np.asarray(found.x)
+            frames.append(Lift(x=x, tip=tip, held=held, grasp=grasp))
+    return tuple(frames)
+
+
+def follow(filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence]) -> tuple[Update, Stated]:
+    """All frames, the jaws opening after each lift; the last update, and what is stated at the end."""
+    belief, b, grasp, update = sheet_prior(), jnp.zeros(sheet().n), 1, None
+    for frame, one in zip(frames, seen, strict=True):
+        if frame.grasp != grasp:
+            stated = filter.release(belief)
+            assert stated is not None
+            belief, b, grasp = stated.belief, stated.b, frame.grasp
+        update = filter.update(belief, b, one, one.y)
+        belief, b = update.belief, update.b
+    stated = filter.release(belief)
+    assert update is not None and stated is not None
+    return update, stated
+
+
+def nees(belief: AttachmentBelief) -> float:
+    """Squared error of the attached particles' s in units of their stated covariance, per degree of freedom, where
+    attached means `STIFFNESS`; free ones are exactly where the prior has its peak, and would be none."""
+    mean, covariance = (np.asarray(part) for part in belief.moments())
+    stated = Belief(mean=mean, covariance=covariance, reference=float(belief.reference))
+    found = nees_per_dof(stated, STIFFNESS * attached(), among=attached())
+    assert found is not None
+    return found
+
+
+def cloud(x: np.ndarray, seed: int, sd: float) -> np.ndarray:
+    """1500 points anywhere on the sheet at x, with noise, in no order."""
+    rng = np.random.default_rng(seed)
+    corner = sheet().faces[rng.integers(len(sheet().faces), size=1500)]
+    weights = rng.dirichlet(np.ones(3), len(corner))
+    return np.einsum("pk,pki->pi", weights, x[corner]) + sd * rng.normal(size=(len(corner), 3))
+
+
+def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:
+    """Noisy positions, and held particles as the tip says."""
+    noisy = frame.x + NOISE * np.random.default_rng(seed).normal(size=frame.x.shape)
+    sd = np.where(frame.held, GRIP_SD, NOISE)
+    precision = np.eye(3) / sd[:, None, None] ** 2
+    if unseen is not None:
+        precision = np.where(unseen[:, None, None], 0.0, precision)
+    held = jnp.asarray(frame.held)
+    return Evidence(y=jnp.asarray(noisy), precision=jnp.asarray(precision), held=held, loaded=held)
