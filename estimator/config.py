@@ -35,7 +35,7 @@ class EstimatorConfig:
     """How well held particles follow the tip [m]."""
     grip_stiffness: float = 3.0
     """Of the springs that carry held particles with the tip while the state is searched [k]."""
-    judging: Judging = "grasps"
+    refinement: Judging = "grasps"
     """When the implicit filter judges noise and belief thoroughly: 'grasps', whenever the jaws open; 'end', at the end
     alone; 'frames', for a policy, which waits for the belief: at the end alone, and by a few samples after each frame,
     which takes a second or two instead of a sweep's milliseconds."""
@@ -56,8 +56,8 @@ class EstimatorConfig:
                 )
         if self.filter not in get_args(FilterName):
             raise ValueError(f"EstimatorConfig.filter must be one of {get_args(FilterName)}; got {self.filter!r}.")
-        if self.judging not in get_args(Judging):
-            raise ValueError(f"EstimatorConfig.judging must be one of {get_args(Judging)}; got {self.judging!r}.")
+        if self.refinement not in get_args(Judging):
+            raise ValueError(f"EstimatorConfig.judging must be one of {get_args(Judging)}; got {self.refinement!r}.")
         if not (isinstance(self.samples, int) and self.samples >= 1):
             raise ValueError(f"EstimatorConfig.samples must be an integer of at least 1; got {self.samples}.")
         if self.membrane not in ("triangles", "edges"):

@@ -21,23 +21,23 @@ from jiggle_mj.mesh_checks import check_unfolded
 from jiggle_mj.observation import Cut, Declaration, Observation, Suture, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
-from .belief import summaries as stating
+from .belief import summaries as summaries
 from .belief.attachment_belief import AttachmentBelief
 from .belief.boundary_belief import BoundaryBelief
 from .belief.topology import Change, after, meant_by, region_of
 from .blas import one_thread
 from .config import EstimatorConfig
 from .filters.build import build_filter
-from .filters.evidence import Filter, Stated
+from .filters.evidence import Filter, PosteriorSummary
 from .filters.implicit import ImplicitFilter
 from .fusion import fused, pull
 from .grip import GripHold
 from .identification import identify
-from .perception import Believed, Disparity, Sight, TissueMask, Track
+from .perception import Believed, Disparity, Perception, TissueMask, Track
 from .perception.mesh_field import MeshField
 from .physics.environment import Grip
 from .physics.mesh import SheetMesh
-from .planning.pull_predictor import Outlook
+from .planning.pull_predictor import PullPredictor
 
 SEEN = 3e-4
 """Standard deviation of a seen coordinate before the first frame has said how well it is seen [m]."""
@@ -67,7 +67,7 @@ class Estimator:
         self.declaration, self.config = declaration, config or EstimatorConfig()
         self.skipped: list[tuple[int, str]] = []
         """Index and reason of each observation that could not be used."""
-        self._sight = Sight(declaration, camera, spacing=self.config.spacing, mask=mask, disparity=disparity)
+        self._perception = Perception(declaration, camera, spacing=self.config.spacing, mask=mask, disparity=disparity)
         self._filter: Filter | None = None
         self._hold: GripHold | None = None
         self._closing: ToolState | None = None
@@ -88,7 +88,7 @@ class Estimator:
             ValueError: asked before the first frame with closed jaws.
         """
         self._check_begun()
-        return self._sight.sheet()
+        return self._perception.sheet()
 
     def begin(self) -> Sheet:
         """Fix the sheet by the frames so far, before the jaws close, so that a first grasp can be planned.
@@ -98,7 +98,7 @@ class Estimator:
             MeshError: the sheet at rest is folded, or not one sheet.
         """
         if self._filter is None:
-            if not self._sight.ready:
+            if not self._perception.ready:
                 raise PerceptionError("no frame has shown the sheet yet; wait for one before planning a grasp.")
             with jax.enable_x64(True), one_thread():
                 self._filter = self._begin()
@@ -118,7 +118,7 @@ class Estimator:
     @property
     def rest_time(self) -> int:
         """When the sheet lay as its rest shape has it [ns], once a frame has shown it."""
-        return self._sight.rest_time
+        return self._perception.rest_time
 
     @property
     def hold(self) -> GripHold | None:
@@ -128,7 +128,7 @@ class Estimator:
     @property
     def track_ids(self) -> Int[np.ndarray, " n"] | None:
         """Which tracked point each particle is; None where they have no names."""
-        return self._sight.track_ids
+        return self._perception.track_ids
 
     @property
     def slip(self) -> float:
@@ -140,12 +140,12 @@ class Estimator:
         """As the robot last reported it."""
         return self._tool
 
-    def loaded(self, held: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    def force_unknown(self, held: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Particles that a grip on those which are held may pull at, themselves among them."""
         self._check_begun()
         return self._field.widened(held)
 
-    def outlook(self, about: Bool[np.ndarray, " n"] | None = None) -> Outlook:
+    def predictor(self, about: Bool[np.ndarray, " n"] | None = None) -> PullPredictor:
         """What pulls would show and cost, as far as is believed now; `release` first, once a grasp is over.
 
         Args:
@@ -158,8 +158,8 @@ class Estimator:
         implicit, belief = self._implicit("predicts pulls")
         position = 1.0 if implicit.noise is None else implicit.noise.position
         asked = jnp.ones(len(self._x), dtype=bool) if about is None else jnp.asarray(about)
-        sight = jnp.asarray(self._sharpness / position)
-        return Outlook.build(implicit.balance, belief, sight, asked)
+        point_precision = jnp.asarray(self._sharpness / position)
+        return PullPredictor.build(implicit.balance, belief, point_precision, asked)
 
     @property
     def belief(self) -> Belief:
@@ -170,7 +170,7 @@ class Estimator:
         """
         self._check_begun()
         with jax.enable_x64(True), one_thread():
-            return stating.belief(self._stated)
+            return summaries.belief(self._summary)
 
     @property
     def detection(self) -> Detection:
@@ -181,7 +181,9 @@ class Estimator:
         """
         self._check_begun()
         assert self._filter is not None
-        return stating.detection(self._stated, self._filter, self.declaration, self.config, converged=self._converged)
+        return summaries.detection(
+            self._summary, self._filter, self.declaration, self.config, converged=self._converged
+        )
 
     def update(self, observation: Observation) -> Estimate | None:
         """Take one observation; None when it only helps to fix the rest shape, or cannot be used.
@@ -216,10 +218,10 @@ class Estimator:
     def _release(self, *, at_the_end: bool = False) -> None:
         if self._filter is None:
             return
-        thorough = at_the_end or self.config.judging == "grasps"
+        thorough = at_the_end or self.config.refinement == "grasps"
         with jax.enable_x64(True), one_thread():
-            if (again := self._filter.release(self._stated.belief, thorough=thorough)) is not None:
-                self._judge(again)
+            if (again := self._filter.release(self._summary.belief, thorough=thorough)) is not None:
+                self._refine(again)
 
     def identify(self, *, on_pass: Callable[[dict[str, float]], None] = lambda _: None) -> Material:
         """The sheet's own parameters from all frames so far; the belief becomes the one that goes with them.
@@ -235,14 +237,14 @@ class Estimator:
         self.release()
         implicit, belief = self._implicit("can identify the sheet")
         with jax.enable_x64(True), one_thread():
-            factors, log_sd, stated, converged = identify(implicit, belief, self._stated.b, on_pass=on_pass)
-            self._judge(stated)
+            factors, log_sd, summary, converged = identify(implicit, belief, self._summary.b, on_pass=on_pass)
+            self._refine(summary)
         return material(self.declaration, factors, log_sd, converged=converged)
 
     def _update(self, observation: Observation) -> Estimate | None:
         tool = self._tool = observation.tool
         if self._filter is None:
-            if (passed_over := self._sight.look_at_rest(observation)) is not None:
+            if (passed_over := self._perception.look_at_rest(observation)) is not None:
                 self.skipped.append((observation.index, passed_over))
             if not (tool.closed or observation.events):
                 return None
@@ -267,25 +269,25 @@ class Estimator:
         hold, before = self._grip(track, tool)
         frame = fused(track, hold, tool, before, grip_sd=self.config.grip_sd, field=self._field)
         self._slip, self._sharpness = frame.slip, track.precision[track.visible].mean(axis=0)
-        update = self._filter.update(self._stated.belief, self._stated.b, frame.evidence, jnp.asarray(frame.start))
+        update = self._filter.update(self._summary.belief, self._summary.b, frame.evidence, jnp.asarray(frame.start))
         if not (np.isfinite(update.x).all() and np.isfinite(update.b).all()):
             raise PerceptionError(
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
             )
         self._hold, self._x = hold, np.asarray(update.x)
-        again = self._filter.reconsider(update.belief) if self.config.judging == "frames" else None
-        stated = again or update
-        self._stated, b = stated, np.asarray(stated.b)
+        again = self._filter.reconsider(update.belief) if self.config.refinement == "frames" else None
+        summary = again or update
+        self._summary, b = summary, np.asarray(summary.b)
         return Estimate(
             index=observation.index,
             time=observation.time,
             positions=self._x,
             observed=track.positions,
             mean=b,
-            sd=np.asarray(stated.sd),
-            probability=np.asarray(stated.probability),
+            sd=np.asarray(summary.sd),
+            probability=np.asarray(summary.probability),
             held=hold.held,
-            entropy=float(stated.entropy),
+            entropy=float(summary.entropy),
             nis=float(update.nis),
             boundary_energy=0.5 * float(np.mean(b * np.sum((self._x - self.sheet.rest) ** 2, axis=1))),
             update_s=time.perf_counter() - seen,
@@ -301,19 +303,19 @@ class Estimator:
             return
         self._release()
         assert self._filter is not None
-        belief = self._stated.belief
+        belief = self._summary.belief
         if isinstance(belief, AttachmentBelief) and isinstance(self._filter, ImplicitFilter):
             if self.changes:
                 self.changes[-1].evidence = self._filter.evidence()
             self.changes.append(Change(event=event, index=index, region=region, before=belief))
-            self._stated = self._filter.restart(after(belief, event, region))
+            self._summary = self._filter.restart(after(belief, event, region))
             return
         assert isinstance(belief, BoundaryBelief)
         meant = meant_by(event)
         change = jnp.where(region, meant - belief.mean(), 0.0)
         sd = max(self.config.prior_sd * self.declaration.membrane_stiffness, meant)
         belief = belief.predict(change, jnp.where(region, sd**2, 0.0))
-        self._stated = replace(self._stated, belief=belief, b=belief.non_negative_mean())
+        self._summary = replace(self._summary, belief=belief, b=belief.non_negative_mean())
         self._filter.forget()
 
     def worked(self, change: Change) -> float | None:
@@ -326,19 +328,19 @@ class Estimator:
             evidence = change.evidence if change is not self.changes[-1] else implicit.evidence()
             return None if evidence is None else change.log_bayes_factor(*evidence)
 
-    def _judge(self, stated: Stated) -> None:
+    def _refine(self, summary: PosteriorSummary) -> None:
         """Believe what all frames together say."""
-        if not all(np.isfinite(part).all() for part in (stated.b, stated.sd, stated.probability)):
+        if not all(np.isfinite(part).all() for part in (summary.b, summary.sd, summary.probability)):
             raise PerceptionError(
                 "judged again, the frames of all grasps leave no finite belief: no attachments explain them together. "
                 "What was believed before stays; leave out grasps to find the one that does not fit."
             )
-        self._stated, self._converged = stated, bool(stated.converged)
+        self._summary, self._converged = summary, bool(summary.converged)
 
     def _implicit(self, does: str) -> tuple[ImplicitFilter, AttachmentBelief]:
         """What only the filter 'implicit' does is done with these."""
-        if isinstance(self._filter, ImplicitFilter) and isinstance(self._stated.belief, AttachmentBelief):
-            return self._filter, self._stated.belief
+        if isinstance(self._filter, ImplicitFilter) and isinstance(self._summary.belief, AttachmentBelief):
+            return self._filter, self._summary.belief
         raise ValueError(f"only the filter 'implicit' {does}; this one is {self.config.filter!r}.")
 
     def _check_begun(self) -> None:
@@ -347,14 +349,14 @@ class Estimator:
 
     def _begin(self) -> Filter:
         """Build the model once the rest shape is known."""
-        sheet = self._sight.sheet()
+        sheet = self._perception.sheet()
         mesh, plane = SheetMesh(sheet.rest, sheet.faces), SheetPlane.through(sheet.rest)
         check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
         self._field = MeshField(plane.flatten(mesh.rest), mesh.faces)
         found, belief = build_filter(mesh, self.declaration, self.config)
         entropy, unknown = belief.entropy(), jnp.full(mesh.n, jnp.nan)
         self.prior_entropy = float(entropy)
-        self._stated = Stated(
+        self._summary = PosteriorSummary(
             belief=belief,
             b=jnp.zeros(mesh.n),
             sd=unknown,
@@ -366,20 +368,20 @@ class Estimator:
         return found
 
     def _see(self, observation: Observation) -> Track:
-        return self._sight.track(observation, predicted=self._x, believed=lambda: self._believed(observation.tool))
+        return self._perception.track(observation, predicted=self._x, believed=lambda: self._believed(observation.tool))
 
     def _believed(self, tool: ToolState) -> Believed:
         """What a cloud is met with: the state before, and how the tip has moved."""
         hold, before = self._grip(Track.of_nothing(len(self._x)), tool)
         stiffness = jnp.where(hold.held, self.config.grip_stiffness * self.declaration.membrane_stiffness, 0.0)
         moved = pull(before, tool, hold)
-        return before, np.asarray(self._stated.b), Grip.of(moved.tip, moved.length, stiffness)
+        return before, np.asarray(self._summary.b), Grip.of(moved.tip, moved.length, stiffness)
 
     def _lies(self, observation: Observation) -> Float[np.ndarray, "n 3"]:
         """Where the sheet lies with the jaws open; what is not seen moves with its surroundings."""
         rest = self.sheet.rest
         try:
-            if not self._sight.identifies:
+            if not self._perception.identifies:
                 return rest
             track = self._see(observation)
         except PerceptionError:
@@ -408,7 +410,7 @@ class Estimator:
 
     def _named(self, tool: ToolState) -> Bool[np.ndarray, " n"] | None:
         """Particles that the recording or the declaration says are held; only points have names."""
-        if (ids := self._sight.track_ids) is None:
+        if (ids := self._perception.track_ids) is None:
             return None
         if tool.held_tracks:
             return np.isin(ids, tool.held_tracks)

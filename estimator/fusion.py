@@ -62,7 +62,7 @@ def fused(
         y=jnp.asarray(np.where(known[:, None], y, start)),
         precision=jnp.asarray(precision),
         held=jnp.asarray(held),
-        loaded=jnp.asarray(field.widened(held)),
+        force_unknown=jnp.asarray(field.widened(held)),
         pull=pull(before, tool, hold),
     )
     return Fused(evidence=evidence, start=start, slip=float(np.median(off)) if len(off) else 0.0)

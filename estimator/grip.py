@@ -47,13 +47,13 @@ class GripHold:
             )
         return cls(grasp=tool.grasp, held=held, closed_at=positions, tip=tool.position, turn=_orientation(tool))
 
-    def turned(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
+    def rotated(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
         """Where the held particles would be if they had only turned with the tool, about the tip, since then [m]."""
         return self.tip + (_orientation(tool) * self.turn.inv()).apply(self.closed_at - self.tip)
 
     def expected(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
         """Where the held particles are if they went with the tool [m]; meaningless for the others."""
-        return self.turned(tool) + (tool.position - self.tip)
+        return self.rotated(tool) + (tool.position - self.tip)
 
 
 def _orientation(tool: ToolState) -> Rotation:

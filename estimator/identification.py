@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .belief.attachment_belief import AttachmentBelief
-from .filters.evidence import Evidence, Stated
+from .filters.evidence import Evidence, PosteriorSummary
 from .filters.force_balance import ForceBalance
 from .filters.implicit import ImplicitFilter
 from .physics.ratios import ratios, scaled
@@ -42,7 +42,7 @@ def identify(
     b: Float[Array, " n"],
     *,
     on_pass: Callable[[dict[str, float]], None],
-) -> tuple[dict[str, float], dict[str, float], Stated, bool]:
+) -> tuple[dict[str, float], dict[str, float], PosteriorSummary, bool]:
     """Find the factors after all frames, and the attachments with them; the filter goes on with both.
 
     Returns their factors by name, the standard errors of the logarithms, what is stated with them, and whether the
@@ -64,16 +64,16 @@ def identify(
         small = bool((np.abs(step) < AT_REST * np.sqrt(np.diagonal(covariance))).all())
         found = found + np.clip(step, -STEP, STEP)
         on_pass(dict(zip(names, np.exp(found), strict=True)))
-        stated = filter.of(belief, scaled(declared, jnp.asarray(found)))
-        assert isinstance(stated.belief, AttachmentBelief)
-        belief, b = stated.belief, stated.b
+        summary = filter.of(belief, scaled(declared, jnp.asarray(found)))
+        assert isinstance(summary.belief, AttachmentBelief)
+        belief, b = summary.belief, summary.b
         passes += 1
         if small or passes == PASSES:
             break
     return (
         dict(zip(names, np.exp(found).tolist(), strict=True)),
         dict(zip(names, np.sqrt(np.diagonal(covariance)).tolist(), strict=True)),
-        stated,
+        summary,
         small,
     )
 

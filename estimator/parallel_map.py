@@ -13,7 +13,7 @@ A_CORE = 2
 """How many take turns on a core: of three that are as long, the third need not wait for two cores to be free."""
 
 
-def side_by_side(of: Callable[[int], T], keys: Iterable[int]) -> dict[int, T]:
+def parallel_map(of: Callable[[int], T], keys: Iterable[int]) -> dict[int, T]:
     """What a function gives for each, in their order."""
     keys, wide = list(keys), jax.config.read("jax_enable_x64")
 

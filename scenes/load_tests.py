@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from .disturbances.registry import MATERIAL
 from .disturbances.world import Gravity
-from .scene.scene import Bed, Scene, Tissue
+from .scene.scene import BedConfig, Scene, TissueConfig
 from .tissue.simulation import Simulation
 
 STRAIN = 2e-3
@@ -55,7 +55,7 @@ class Stiffness:
     """D [N m]; NaN on a mesh too coarse to tell."""
 
 
-def typed(tissue: Tissue) -> Stiffness:
+def typed(tissue: TissueConfig) -> Stiffness:
     """What the typed material has, as an isotropic plate."""
     stretch, nu = tissue.young * tissue.thickness, tissue.poisson
     return Stiffness(
@@ -92,19 +92,19 @@ def far_from_declared(scene: Scene, found: tuple[Stiffness, ...]) -> list[str]:
     ]
 
 
-def load_tests(scene: Scene, *, say: Callable[[str], None] = lambda _: None) -> tuple[Stiffness, ...]:
+def load_tests(scene: Scene, *, log: Callable[[str], None] = lambda _: None) -> tuple[Stiffness, ...]:
     """Stiffness of the scene's sheet on its own mesh, a finer one, and a coarser one unless it is too coarse.
 
     Args:
         scene: its tissue, with those disturbances of the material that begin at 0.
-        say: told what comes next.
+        log: told what comes next.
     """
     found = []
     for times in MESHES:
         spacing = times * scene.tissue.spacing
         if times > 1 and spacing > min(scene.tissue.size) / 4:
             continue
-        say(f"spacing {1e3 * spacing:.2f} mm")
+        log(f"spacing {1e3 * spacing:.2f} mm")
         found.append(stiffness(replace(scene, tissue=replace(scene.tissue, spacing=spacing))))
     return tuple(found)
 
@@ -126,7 +126,9 @@ def stiffness(scene: Scene) -> Stiffness:
 def floating(scene: Scene) -> Simulation:
     """The sheet alone, without weight."""
     material = tuple(one for one in scene.disturbances if isinstance(one, MATERIAL) and one.start == 0)
-    alone = replace(scene, attachments=(), bed=Bed(present=False), disturbances=(*material, Gravity(magnitude=0.0)))
+    alone = replace(
+        scene, attachments=(), bed=BedConfig(present=False), disturbances=(*material, Gravity(magnitude=0.0))
+    )
     return Simulation(alone, drawn=False)
 
 

@@ -16,24 +16,36 @@ from .disturbances.registry import named
 from .scene.attachments import SHAPES, Attachment
 from .scene.disturbance import Disturbance
 from .scene.scene import (
-    Bed,
-    Camera,
-    Declared,
-    Lights,
-    Limits,
-    Procedure,
-    Programme,
+    BedConfig,
+    CameraConfig,
+    DeclaredConfig,
+    LightsConfig,
+    LimitsConfig,
+    ProcedureConfig,
+    ProgrammeConfig,
     Scene,
-    Sensing,
-    Texture,
-    Tissue,
-    Tweezer,
+    SensingConfig,
+    TextureConfig,
+    TissueConfig,
+    TweezerConfig,
 )
 from .scene.section import Section, checked
 
 SECTIONS: dict[str, type[Section]] = {
     cls.section: cls
-    for cls in (Tissue, Bed, Tweezer, Programme, Procedure, Limits, Camera, Lights, Texture, Sensing, Declared)
+    for cls in (
+        TissueConfig,
+        BedConfig,
+        TweezerConfig,
+        ProgrammeConfig,
+        ProcedureConfig,
+        LimitsConfig,
+        CameraConfig,
+        LightsConfig,
+        TextureConfig,
+        SensingConfig,
+        DeclaredConfig,
+    )
 }
 FOLDER = Path(__file__).parent
 

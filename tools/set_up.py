@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV_PACKAGE = f"python{sys.version_info.major}.{sys.version_info.minor}-venv"
 
 
-def say(text: str) -> None:
+def log(text: str) -> None:
     """Tell progress on stderr."""
     print(f"set-up: {text}", file=sys.stderr, flush=True)
 
@@ -59,7 +59,7 @@ def install_packages(packages: list[str], purpose: str) -> None:
             f"set-up: {purpose} needs the Debian package(s) {' '.join(packages)}, and this user cannot install them "
             f"here. Run 'sudo apt-get install {' '.join(packages)}' (or your system's equivalent), then try again."
         )
-    say(f"{purpose}: installing {' '.join(packages)} with apt-get")
+    log(f"{purpose}: installing {' '.join(packages)} with apt-get")
     refresh_package_lists(*apt)
     options = ["-o", "DPkg::Lock::Timeout=300", "-o", "Dpkg::Use-Pty=0", "-qq", "-y", "--no-install-recommends"]
     run(*apt, *options, "install", *packages, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})
@@ -72,7 +72,7 @@ def make_environment(venv: Path) -> Path:
     if not python.exists() or subprocess.run([python, "-c", usable]).returncode:
         if importlib.util.find_spec("ensurepip") is None:
             install_packages([VENV_PACKAGE], "Python's venv module")
-        say(f"making {venv} with Python {sys.version.split()[0]}")
+        log(f"making {venv} with Python {sys.version.split()[0]}")
         run(sys.executable, "-m", "venv", "--clear", venv)
     if subprocess.run([python, "-c", "import pip"], capture_output=True).returncode:
         run(python, "-m", "ensurepip")
@@ -82,7 +82,7 @@ def make_environment(venv: Path) -> Path:
 def install_project(python: Path) -> None:
     """Install the locked dependencies, each checked against its hash, and the project itself, editable."""
     pip = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
-    say("installing the locked packages (about 330 MB to download the first time)")
+    log("installing the locked packages (about 330 MB to download the first time)")
     run(*pip, "--require-hashes", "--only-binary", ":all:", "--requirement", ROOT / "requirements-dev.lock")
     run(*pip, "--no-deps", "--no-build-isolation", "--editable", ROOT)
 
@@ -100,7 +100,7 @@ def set_up_opengl(python: Path) -> None:
     failure = render_failure(python, backend)
     if failure is None:
         return
-    say(f"no offscreen OpenGL yet ({failure})")
+    log(f"no offscreen OpenGL yet ({failure})")
     code = f"from jiggle_mj.doctor import OPENGL_PACKAGES; print(*OPENGL_PACKAGES.get({backend!r}, ()))"
     packages = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     if not packages:
@@ -119,7 +119,7 @@ def main() -> None:
     python = make_environment(venv)
     install_project(python)
     set_up_opengl(python)
-    say(f"done: {venv}")
+    log(f"done: {venv}")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..effects.sheet_model import Moment
+from ..effects.sheet_model import FrameContext
 
 USUAL_GAP = 0.25
 """Between frames, where the jaws have just closed [s]."""
@@ -24,9 +24,9 @@ class ClosedFrame(eqx.Module):
     precision: Float[Array, "n 3 3"]
     """Inverse covariance of the white noise, zero where nothing is seen [1/m^2]."""
     held: Bool[Array, " n"]
-    loaded: Bool[Array, " n"]
+    force_unknown: Bool[Array, " n"]
     """Near the grip, where forces are not reckoned with."""
-    turned: Float[Array, "n 3"]
+    rotated: Float[Array, "n 3"]
     """Where the jaws closed on the held particles, turned about the tip as the tool has turned since [m]."""
     way: Float[Array, " 3"]
     """How far the tool says that it has gone since [m]."""
@@ -60,7 +60,7 @@ class Timed:
     """Times [s], as `time`, and the tool's way [m] by its reports since the frame before and in this one."""
 
 
-class History:
+class FrameHistory:
     """The moments of a recording's frames, for states as far as they are known."""
 
     def __init__(self, frames: list[Timed], rest: Float[np.ndarray, "n 3"]) -> None:
@@ -81,7 +81,7 @@ class History:
             found.setdefault(of(self.frames[k]), []).append(k)
         return found
 
-    def moment(self, k: int, states: Float[np.ndarray, "frames n 3"] | Float[Array, "frames n 3"]) -> Moment:
+    def moment(self, k: int, states: Float[np.ndarray, "frames n 3"] | Float[Array, "frames n 3"]) -> FrameContext:
         """What an effect may know of frame k."""
         one, follows = self.frames[k], self._follows
         twice = follows[k] and follows[k - 1]
@@ -89,7 +89,7 @@ class History:
         before = states[k - 1] if follows[k] else one.state
         gap = self._times[k] - self._times[k - 1] if follows[k] else USUAL_GAP
         earlier_gap = self._times[k - 1] - self._times[k - 2] if twice else USUAL_GAP
-        return Moment(
+        return FrameContext(
             rest=self.rest,
             time=jnp.asarray(one.time, dtype=float),  # said, so that all moments are compiled for as one
             gap=jnp.asarray(gap, dtype=float),

@@ -12,18 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..effects import LIBRARY, Effect
+from .dataset import Dataset
 from .fit import STIFFEST, Fitted, doubted, fit, start
-from .gather import Gathered
-from .held_out import Foretold, foretell, foretold
-from .leftover import leftover
+from .held_out import HeldOut, held_out, predict_held_out
+from .hypotheses import REMAINDER, FitContext, Hypothesis, left_out
 from .problem import Problem
-from .search import MOST, Added, Refused, following, revised
-from .trials import REMAINDER, Stage, Trial, left_out
+from .search import MOST, AddedHypothesis, Refused, following, revised
+from .unexplained_residual import unexplained_residual
 from .users_effects import check_effects
 
 EXCESS = 5.0
 """How many times the stated variance parts left out may be missed before something is said to be left over."""
-LEFT_OVER = ("unexplained", "effect-with-remainder")
+UNEXPLAINED = ("unexplained", "effect-with-remainder")
 """Verdicts that say so."""
 
 
@@ -33,71 +33,76 @@ class Closed:
 
     verdict: str
     """no-effect, effect, ambiguous, effect-with-remainder or unexplained."""
-    accepted: list[Trial]
-    rivals: list[list[Trial]]
+    accepted: list[Hypothesis]
+    rivals: list[list[Hypothesis]]
     """Of each of those accepted: effects that it could not be told from."""
     refused: Refused
-    stages: list[Stage]
+    stages: list[FitContext]
     """The first with what is declared alone."""
     final: Fitted
     """The last stage's fit; where something is left over, doubted as much as its parts are missed by fits without them,
     so that less is called attached for a cause that has no name."""
-    reported: tuple[Foretold, Foretold] | None
+    reported: tuple[HeldOut, HeldOut] | None
     """A part that chose no effect, foretold before and after; None if there was none to spare."""
     problem: Problem
 
 
 def close_the_loop(
-    gathered: Gathered, *, library: tuple[Effect, ...] = LIBRARY, say: Callable[[str], None] = lambda _: None
+    dataset: Dataset, *, library: tuple[Effect, ...] = LIBRARY, log: Callable[[str], None] = lambda _: None
 ) -> Closed:
     """Over a recording that was followed.
 
     Args:
-        gathered: what was seen.
+        dataset: what was seen.
         library: effects that the model may lack.
-        say: told what is being done.
+        log: told what is being done.
 
     Raises:
         ValueError: an effect that is not of the library cannot be used; see `check_effects`.
     """
-    problem = Problem.build(gathered, library)
+    problem = Problem.build(dataset, library)
     check_effects(problem)
-    parts = list(dict.fromkeys(one.part for one in gathered.frames))
+    parts = list(dict.fromkeys(one.part for one in dataset.frames))
     spare = parts[-1] if len(parts) > 1 else None
     used = set(parts) - {spare}
-    if gathered.left_out:
-        say(f"{len(gathered.left_out)} frames left out: what is held is seen in another shape there")
-    say(f"fitting {len(problem.frames(used))} frames in {len(used)} parts with what is declared")
-    stages, added, refused, at_last = [_declared(problem, gathered, used, say)], list[Added](), Refused(), Refused()
+    if dataset.left_out:
+        log(f"{len(dataset.left_out)} frames left out: what is held is seen in another shape there")
+    log(f"fitting {len(problem.frames(used))} frames in {len(used)} parts with what is declared")
+    stages, added, refused, at_last = (
+        [_declared(problem, dataset, used, log)],
+        list[AddedHypothesis](),
+        Refused(),
+        Refused(),
+    )
     while len(added) < MOST:
-        found, more = following(problem, stages[-1], added, used, say)
+        found, more = following(problem, stages[-1], added, used, log)
         if found is added:
             at_last = more
             break
         refused += more
         added = found
-        stages.append(added[-1].stage)
-        say(f"added by now: {', '.join(one.trial.effect.name for one in added)}")
+        stages.append(added[-1].context)
+        log(f"added by now: {', '.join(one.trial.effect.name for one in added)}")
     if len(added) > 1:
-        added = revised(problem, added, used, say)
-        stages.append(added[-1].stage)
-    accepted, names = [one.trial for one in added], {one.trial.effect.name for one in added}
+        added = revised(problem, added, used, log)
+        stages.append(added[-1].context)
+    accepted, names = [one.hypothesis for one in added], {one.hypothesis.effect.name for one in added}
     rivals = [[one for one in group.rivals if one.effect.name not in names] for group in added]
     refused += [pair for group in added for pair in group.others] + at_last
     last_said = {one.effect.name: (one, why) for one, why in refused}
     named = names | {one.effect.name for group in rivals for one in group}
     reported = None
     if spare is not None:
-        before = foretell(problem, stages[0].fitted, spare)
-        reported = before, foretell(problem, stages[-1].fitted, spare) if accepted else before
+        before = predict_held_out(problem, stages[0].fitted, spare)
+        reported = before, predict_held_out(problem, stages[-1].fitted, spare) if accepted else before
     last = stages[-1]
-    folds = [Foretold.together(last.folds)] if last.folds else []
-    missed = folds + ([] if reported is None else [reported[1]])
-    left_over = last.left.gain > REMAINDER or any(one.excess > EXCESS for one in missed)
-    verdict, final = _verdict(accepted, rivals, left_over), last.fitted
-    if verdict in LEFT_OVER and folds:
+    folds = [HeldOut.together(last.folds)] if last.folds else []
+    residual = folds + ([] if reported is None else [reported[1]])
+    unexplained = last.left.gain > REMAINDER or any(one.excess > EXCESS for one in residual)
+    verdict, final = _verdict(accepted, rivals, unexplained), last.fitted
+    if verdict in UNEXPLAINED and folds:
         doubt = max(folds[0].excess, 1.0)
-        say(f"what frames say counts {doubt:.1f} times less, as each of the parts is missed by that without it")
+        log(f"what frames say counts {doubt:.1f} times less, as each of the parts is missed by that without it")
         final = doubted(problem, final, doubt)
     return Closed(
         verdict=verdict,
@@ -111,21 +116,21 @@ def close_the_loop(
     )
 
 
-def _declared(problem: Problem, gathered: Gathered, used: set[int], say: Callable[[str], None]) -> Stage:
+def _declared(problem: Problem, dataset: Dataset, used: set[int], log: Callable[[str], None]) -> FitContext:
     """The fit with no effect, from what the filter says."""
-    found = gathered.detection
+    found = dataset.detection
     b = jnp.asarray(np.where(found.attached, found.stiffness, 0.0))
     s = np.minimum(np.asarray(problem.prior.bounded(b)), STIFFEST)
-    states = np.array([one.state for one in gathered.frames])
+    states = np.array([one.state for one in dataset.frames])
     point = start(problem, np.zeros(problem.sheet.size), s, states, problem.frames(used))
-    fitted = fit(problem, np.zeros(0, dtype=int), point, used, say=say)
-    folds = foretold(problem, left_out(problem, fitted, used))
-    return Stage(fitted=fitted, left=leftover(problem, fitted), folds=folds, scores=[])
+    fitted = fit(problem, np.zeros(0, dtype=int), point, used, log=log)
+    folds = held_out(problem, left_out(problem, fitted, used))
+    return FitContext(fitted=fitted, left=unexplained_residual(problem, fitted), folds=folds, scores=[])
 
 
-def _verdict(accepted: list[Trial], rivals: list[list[Trial]], left_over: bool) -> str:
+def _verdict(accepted: list[Hypothesis], rivals: list[list[Hypothesis]], unexplained: bool) -> str:
     if not accepted:
-        return "unexplained" if left_over else "no-effect"
-    if left_over:
+        return "unexplained" if unexplained else "no-effect"
+    if unexplained:
         return "effect-with-remainder"
     return "ambiguous" if any(rivals) else "effect"

@@ -4,17 +4,17 @@ from typing import Any
 
 from .baselines import in_proportion, unmoved
 from .closing import Closed
-from .gather import Gathered
-from .held_out import Foretold
+from .dataset import Dataset
+from .held_out import HeldOut
+from .hypotheses import Hypothesis, reported_sd
 from .localisation import localisation
 from .suggestion import Suggestion
-from .trials import Trial, stated_sd
 
 
-def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
+def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
     """Numbers, strings and lists alone; lengths in metres, log Bayes factors in nat. No pull is suggested yet."""
     first, last = closed.stages[0], closed.stages[-1]
-    noise, before = gathered.noise, localisation(closed.problem, first.fitted)
+    noise, before = dataset.noise, localisation(closed.problem, first.fitted)
     return {
         "verdict": closed.verdict,
         "effects": [_effect(closed, *each) for each in zip(closed.accepted, closed.rivals, strict=True)],
@@ -45,7 +45,7 @@ def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
                 for before, after in zip(first.folds, last.folds, strict=True)
             ],
             **_reported(closed.reported),
-            **_baselines(closed, gathered),
+            **_baselines(closed, dataset),
         },
         "noise": {
             "sd_m": noise.sd,
@@ -53,7 +53,7 @@ def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
             "smooth_length_m": noise.length,
             "still_frames": noise.frames,
         },
-        "frames": {"used": len(gathered.frames), "left_out": list(gathered.left_out)},
+        "frames": {"used": len(dataset.frames), "left_out": list(dataset.left_out)},
         "localisation": before,
         "localisation_after": before if closed.final is first.fitted else localisation(closed.problem, closed.final),
         "suggestion": None,
@@ -62,12 +62,12 @@ def discrepancy(closed: Closed, gathered: Gathered) -> dict[str, Any]:
     }
 
 
-def _effect(closed: Closed, one: Trial, rivals: list[Trial]) -> dict[str, Any]:
+def _effect(closed: Closed, one: Hypothesis, rivals: list[Hypothesis]) -> dict[str, Any]:
     return {
         "name": one.effect.name,
         "site": one.score.site if one.effect.sites > 1 else None,
         "theta": one.theta.tolist(),
-        "sd": stated_sd(closed.problem, one).tolist(),
+        "sd": reported_sd(closed.problem, one).tolist(),
         "units": list(one.effect.units),
         "log_bayes_factor": one.log_bayes_factor,
         "p_value": one.score.p_value,
@@ -77,11 +77,11 @@ def _effect(closed: Closed, one: Trial, rivals: list[Trial]) -> dict[str, Any]:
     }
 
 
-def _baselines(closed: Closed, gathered: Gathered) -> dict[str, float | None]:
+def _baselines(closed: Closed, dataset: Dataset) -> dict[str, float | None]:
     """Of the same grasp, without a model."""
-    spare = None if closed.reported is None else gathered.frames[-1].part
+    spare = None if closed.reported is None else dataset.frames[-1].part
     return {
-        f"{name}_rms_m": None if spare is None else of(gathered.frames, spare)
+        f"{name}_rms_m": None if spare is None else of(dataset.frames, spare)
         for name, of in (("unmoved", unmoved), ("in_proportion", in_proportion))
     }
 
@@ -98,7 +98,7 @@ def suggested(found: Suggestion) -> dict[str, Any]:
     }
 
 
-def _reported(reported: tuple[Foretold, Foretold] | None) -> dict[str, float | None]:
+def _reported(reported: tuple[HeldOut, HeldOut] | None) -> dict[str, float | None]:
     """On the grasp that chose no effect."""
     figures: dict[str, float | None] = {}
     for when, found in zip(("before", "after"), reported or (None, None), strict=True):

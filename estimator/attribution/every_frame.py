@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects.sheet_model import Moment
-from ..parallel_map import T, side_by_side
+from ..effects.sheet_model import FrameContext
+from ..parallel_map import T, parallel_map
 from .closed_frames import ClosedFrame
-from .linear import N_FIELDS, Glance, Metric, Misfit, glance, misfit, weigh
+from .linear import N_FIELDS, Metric, NormalEquations, WeightedResiduals, misfit, normal_equations, weigh
 from .normal_equations import less_offset
 from .problem import Point, Problem
 
@@ -28,7 +28,7 @@ def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metr
     """Every frame at a point: how misfits weigh."""
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
 
-    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Metric:
+    def one(k: int, frame: ClosedFrame, moment: FrameContext, x: Float[Array, "n 3"]) -> Metric:
         return weigh(problem.sheet, theta, s, frame, moment, x, noise)
 
     return _each(problem, point, frames, one)
@@ -36,32 +36,32 @@ def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metr
 
 def linearised(
     problem: Problem, point: Point, weights: dict[int, Metric], along: Float[np.ndarray, "p d"]
-) -> dict[int, Glance]:
+) -> dict[int, NormalEquations]:
     """Every frame where it was weighed: its normal equations."""
     theta, along_ = jnp.asarray(point.theta), jnp.asarray(along)
 
-    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Glance:
-        return glance(problem.sheet, weights[k], theta, along_, frame, moment)
+    def one(k: int, frame: ClosedFrame, moment: FrameContext, x: Float[Array, "n 3"]) -> NormalEquations:
+        return normal_equations(problem.sheet, weights[k], theta, along_, frame, moment)
 
     return _each(problem, point, weights, one)
 
 
 def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> float:
     """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
-    return cost(problem, weights, missed(problem, weights, point), problem.amplitude)
+    return cost(problem, weights, residual(problem, weights, point), problem.amplitude)
 
 
-def missed(problem: Problem, weights: dict[int, Metric], point: Point) -> dict[int, Misfit]:
+def residual(problem: Problem, weights: dict[int, Metric], point: Point) -> dict[int, WeightedResiduals]:
     """How a point's predictions miss every frame, under weights that were reckoned elsewhere."""
     theta = jnp.asarray(point.theta)
 
-    def one(k: int, frame: ClosedFrame, moment: Moment, x: Float[Array, "n 3"]) -> Misfit:
+    def one(k: int, frame: ClosedFrame, moment: FrameContext, x: Float[Array, "n 3"]) -> WeightedResiduals:
         return misfit(problem.sheet, weights[k], theta, frame, moment, x)
 
     return _each(problem, point, weights, one)
 
 
-def cost(problem: Problem, weights: dict[int, Metric], every: dict[int, Misfit], amplitude: float) -> float:
+def cost(problem: Problem, weights: dict[int, Metric], every: dict[int, WeightedResiduals], amplitude: float) -> float:
     """Twice what frames are missed by together [nat], with smooth force fields of that amplitude."""
     total = 0.0
     for frames in problem.by_part(weights).values():
@@ -78,9 +78,9 @@ def _each(
     problem: Problem,
     point: Point,
     frames: Iterable[int],
-    of: Callable[[int, ClosedFrame, Moment, Float[Array, "n 3"]], T],
+    of: Callable[[int, ClosedFrame, FrameContext, Float[Array, "n 3"]], T],
 ) -> dict[int, T]:
     """A function of each frame, of what an effect may know of it, and of its state, at a point."""
     states, history = jnp.asarray(point.states), problem.history
     moments = {k: history.moment(k, states) for k in frames}
-    return side_by_side(lambda k: of(k, history.frames[k].frame, moments[k], states[k]), moments)
+    return parallel_map(lambda k: of(k, history.frames[k].frame, moments[k], states[k]), moments)

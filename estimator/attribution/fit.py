@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..belief.attachment_belief import AttachmentBelief
-from ..filters.evidence import Stated
+from ..filters.evidence import PosteriorSummary
 from ..filters.implicit import likeliest, reconsidered
 from .every_frame import cost_under, directions, linearised, weighed
-from .linear import Glance, Metric
+from .linear import Metric, NormalEquations
 from .normal_equations import reduced
 from .problem import Point, Problem
 from .sheet import predict_all
@@ -55,10 +55,10 @@ class Fitted:
     """All that were fitted, the sheet's own among them."""
     square: Float[np.ndarray, "k k"]
     """Normal equations, over s, the free parameters and -1."""
-    glances: dict[int, Glance]
+    equations: dict[int, NormalEquations]
     weights: dict[int, Metric]
     """By frame."""
-    stated: Stated
+    summary: PosteriorSummary
     """What is believed of the attachments, whatever the free parameters are."""
     cost: float
     """Twice the negative logarithm of likelihood and prior under its own weights [nat]."""
@@ -66,8 +66,8 @@ class Fitted:
     @property
     def belief(self) -> AttachmentBelief:
         """Of the attachments."""
-        assert isinstance(self.stated.belief, AttachmentBelief)
-        return self.stated.belief
+        assert isinstance(self.summary.belief, AttachmentBelief)
+        return self.summary.belief
 
     @property
     def site_precision(self) -> Float[np.ndarray, " n"]:
@@ -77,7 +77,7 @@ class Fitted:
     @property
     def probability(self) -> Float[np.ndarray, " n"]:
         """P(attached) of each. Of attachments that are likeliest together none need be likely by itself."""
-        return np.asarray(self.stated.probability)
+        return np.asarray(self.summary.probability)
 
     @property
     def attached(self) -> Bool[np.ndarray, " n"]:
@@ -95,7 +95,7 @@ def moved(problem: Problem, fitted: Fitted, at: np.ndarray, theta: np.ndarray) -
     """A fit's point with other values of some parameters, and what it predicts then."""
     changed = fitted.point.theta.copy()
     changed[at] = theta
-    return start(problem, changed, fitted.point.s, fitted.point.states, list(fitted.glances))
+    return start(problem, changed, fitted.point.s, fitted.point.states, list(fitted.equations))
 
 
 def fit(
@@ -105,17 +105,17 @@ def fit(
     parts: set[int],
     *,
     passes: int = PASSES,
-    say: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> Fitted:
     """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some parts."""
-    now = best = _reckoned(problem, named, point, problem.frames(parts))
+    now = best = _linearise_at(problem, named, point, problem.frames(parts))
     waited = 0
     for count in range(passes):
         if (better := _better(problem, now, _steps(problem, now))) is None:
             break
-        trial, cost = better
-        say(f"pass {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
-        there = _reckoned(problem, named, trial, problem.frames(parts))
+        hypothesis, cost = better
+        log(f"pass {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
+        there = _linearise_at(problem, named, hypothesis, problem.frames(parts))
         if not np.isfinite(there.cost):
             break
         now = there
@@ -131,9 +131,9 @@ def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
     Not to the attachments likeliest together: of many that are as likely, they are some, and fewer frames would take
     others at random.
     """
-    left = [k for k in fitted.glances if problem.history.frames[k].part != part]
-    glances, weights = {k: fitted.glances[k] for k in left}, {k: fitted.weights[k] for k in left}
-    now = replace(_found(problem, fitted.named, fitted.point, glances, weights), around=fitted.around)
+    left = [k for k in fitted.equations if problem.history.frames[k].part != part]
+    equations, weights = {k: fitted.equations[k] for k in left}, {k: fitted.weights[k] for k in left}
+    now = replace(_found(problem, fitted.named, fitted.point, equations, weights), around=fitted.around)
     better = _better(problem, now, _steps(problem, now, together=False), least=0.0)
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
@@ -144,7 +144,7 @@ def doubted(problem: Problem, fitted: Fitted, excess: float) -> Fitted:
     All that its frames say counts by as much less: quasi-likelihood [Wedderburn 1974, doi:10.1093/biomet/61.3.439].
     """
     sd = problem.sd(fitted.named)
-    return replace(fitted, stated=_stated(problem, fitted.square / excess, fitted.point, fitted.free, sd))
+    return replace(fitted, summary=_summary(problem, fitted.square / excess, fitted.point, fitted.free, sd))
 
 
 def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
@@ -157,7 +157,7 @@ def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, 
     return (plain_there - better.cost) / 2, (plain.cost - better_there) / 2
 
 
-def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> Fitted:
+def _linearise_at(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> Fitted:
     """A point with what is known there."""
     along = directions(problem, problem.free(named))
     weights = weighed(problem, point, frames)
@@ -165,19 +165,19 @@ def _reckoned(problem: Problem, named: np.ndarray, point: Point, frames: list[in
 
 
 def _found(
-    problem: Problem, named: np.ndarray, point: Point, glances: dict[int, Glance], weights: dict[int, Metric]
+    problem: Problem, named: np.ndarray, point: Point, equations: dict[int, NormalEquations], weights: dict[int, Metric]
 ) -> Fitted:
     free, sd = problem.free(named), problem.sd(named)
-    square = reduced(problem, glances, len(free))
+    square = reduced(problem, equations, len(free))
     return Fitted(
         point=point,
         around=point,
         named=named,
         free=free,
         square=square,
-        glances=glances,
+        equations=equations,
         weights=weights,
-        stated=_stated(problem, square, point, free, sd),
+        summary=_summary(problem, square, point, free, sd),
         cost=_cost(problem, weights, point, named),
     )
 
@@ -189,25 +189,25 @@ def _to_its_end(problem: Problem, now: Fitted) -> Fitted:
     so whatever the parameters are.
     """
     theta, s = _after(problem, now, _at_hand(problem, now), 1.0)
-    point = start(problem, theta, s, now.point.states, list(now.glances))
+    point = start(problem, theta, s, now.point.states, list(now.equations))
     cost = _cost(problem, now.weights, point, now.named)
     if not cost < now.cost:
         return now
     n = len(s)
-    gone = np.zeros(len(now.glances[min(now.glances)].square))
+    gone = np.zeros(len(now.equations[min(now.equations)].square))
     gone[n : n + len(now.free)], gone[-1] = (theta - now.point.theta)[now.free], 1.0
-    glances = {k: _carried(one, gone) for k, one in now.glances.items()}
-    square = reduced(problem, glances, len(now.free))
-    return replace(now, point=point, glances=glances, square=square, cost=cost)
+    equations = {k: _transferred(one, gone) for k, one in now.equations.items()}
+    square = reduced(problem, equations, len(now.free))
+    return replace(now, point=point, equations=equations, square=square, cost=cost)
 
 
-def _carried(glance: Glance, gone: Float[np.ndarray, " k"]) -> Glance:
+def _transferred(normal_equations: NormalEquations, gone: Float[np.ndarray, " k"]) -> NormalEquations:
     """A frame's normal equations about a point that is so far off, 1 at the end, as linear as they are."""
-    square, tool = np.array(glance.square), np.array(glance.tool)
+    square, tool = np.array(normal_equations.square), np.array(normal_equations.tool)
     square[:, -1] = square @ gone
     square[-1] = gone @ square
     tool[:, -1] = tool @ gone[-tool.shape[1] :]
-    return Glance(square=jnp.asarray(square), tool=jnp.asarray(tool))
+    return NormalEquations(square=jnp.asarray(square), tool=jnp.asarray(tool))
 
 
 def _better(problem: Problem, now: Fitted, steps: list[Step], *, least: float = GAIN) -> tuple[Point, float] | None:
@@ -222,10 +222,10 @@ def _better(problem: Problem, now: Fitted, steps: list[Step], *, least: float = 
         if promised[k] <= least * now.cost:
             return None
         theta, s = there[k]
-        trial = start(problem, theta, s, now.point.states, list(now.glances))
-        cost = _cost(problem, now.weights, trial, now.named)
+        hypothesis = start(problem, theta, s, now.point.states, list(now.equations))
+        cost = _cost(problem, now.weights, hypothesis, now.named)
         if cost < now.cost:
-            return trial, cost
+            return hypothesis, cost
     return None
 
 
@@ -253,7 +253,7 @@ def _steps(problem: Problem, now: Fitted, *, together: bool = True) -> list[Step
     than not, and yet one must be. Nor is any where a load is lighter than was thought, as all that carry it are softer
     but none of them by itself: there all s may go by one factor. Elsewhere what fits best so would follow the noise.
     """
-    found = problem.prior.bounded(jnp.where(now.stated.probability > 0.5, now.stated.b, 0.0))
+    found = problem.prior.bounded(jnp.where(now.summary.probability > 0.5, now.summary.b, 0.0))
     steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now)]
     if not now.attached.any():
         steps.append(_by_one_factor(problem, now))
@@ -281,7 +281,7 @@ def _towards(problem: Problem, now: Fitted, to: Float[np.ndarray, " n"]) -> Step
     return theta, to - point.s
 
 
-def _stated(problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> Stated:
+def _summary(problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> PosteriorSummary:
     """What is believed of the attachments there, the parameters marginalised."""
     n = len(point.s)
     A, C, gt = _of_parameters(square, point, free, sd)

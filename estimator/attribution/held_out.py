@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import norm
 
-from ..parallel_map import side_by_side
+from ..parallel_map import parallel_map
 from .closed_frames import ClosedFrame
 from .every_frame import weighed
 from .fit import Fitted
@@ -24,7 +24,7 @@ PINNED = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Foretold:
+class HeldOut:
     """A grasp's frames, particles that were seen and not held."""
 
     off: Float[np.ndarray, "m 3"]
@@ -58,19 +58,19 @@ class Foretold:
         return float(np.mean(np.abs(self.off) <= norm.ppf(0.95) * self.sd))
 
     @staticmethod
-    def together(parts: list["Foretold"]) -> "Foretold":
+    def together(parts: list["HeldOut"]) -> "HeldOut":
         """Several grasps."""
-        return Foretold(
+        return HeldOut(
             off=np.concatenate([one.off for one in parts]), reckon=lambda: np.concatenate([one.sd for one in parts])
         )
 
 
-def foretold(problem: Problem, fits: dict[int, Fitted]) -> list[Foretold]:
+def held_out(problem: Problem, fits: dict[int, Fitted]) -> list[HeldOut]:
     """Each part by the fit without it."""
-    return list(side_by_side(lambda part: foretell(problem, fits[part], part), fits).values())
+    return list(parallel_map(lambda part: predict_held_out(problem, fits[part], part), fits).values())
 
 
-def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
+def predict_held_out(problem: Problem, fitted: Fitted, part: int) -> HeldOut:
     """One part that was not fitted to."""
     frames = problem.frames({part})
     anew, closed = from_rest(problem, fitted.point, frames, by_tool=True), problem.history.frames
@@ -81,10 +81,10 @@ def foretell(problem: Problem, fitted: Fitted, part: int) -> Foretold:
         def one(k: int) -> Float[np.ndarray, "n 3"]:
             return _sd(problem, weights[k], closed[k].frame, known, jnp.asarray(anew.states[k]))
 
-        every = side_by_side(one, frames)
+        every = parallel_map(one, frames)
         return np.concatenate([every[k][np.asarray(closed[k].frame.counted)] for k in frames])
 
-    return Foretold(off=off(problem, anew, frames), reckon=sd)
+    return HeldOut(off=off(problem, anew, frames), reckon=sd)
 
 
 def off(problem: Problem, point: Point, frames: list[int]) -> Float[np.ndarray, "m 3"]:

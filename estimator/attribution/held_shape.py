@@ -33,7 +33,7 @@ def _excess(one: Timed, sd: float, fields: Float[np.ndarray, "n modes"]) -> floa
     seen = np.asarray(one.frame.held & one.frame.visible)
     if seen.sum() < FEWEST:
         return 0.0
-    then, now = (np.asarray(where)[seen] for where in (one.frame.turned, one.frame.y))
+    then, now = (np.asarray(where)[seen] for where in (one.frame.rotated, one.frame.y))
     then, now, own = then - then.mean(axis=0), now - now.mean(axis=0), fields[seen] - fields[seen].mean(axis=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a straight row may turn about itself as it likes

@@ -19,12 +19,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..effects.mechanical import cosines, flat
-from ..effects.sheet_model import Moment
+from ..effects.sheet_model import FrameContext
 from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance, Frame
 from ..physics.membrane import TriangleMembrane
 from .closed_frames import ClosedFrame
-from .sheet import Sheet, beyond_tool, look, mean_of_held
+from .sheet import PredictedSheet, beyond_tool, look, mean_of_held
 
 WAVES = 4
 """Cosines along each side of the sheet in the smooth force fields."""
@@ -81,7 +81,7 @@ class Metric(eqx.Module):
         return -2 * (roots[0] + roots[1]) - force + 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
 
 
-class Glance(eqx.Module):
+class NormalEquations(eqx.Module):
     """One frame's normal equations: over s, then theta in given directions, then Q's fields, then -1 for e itself."""
 
     square: Float[Array, "k k"]
@@ -90,7 +90,7 @@ class Glance(eqx.Module):
     """Rows of what the tool says of the held particles, over theta, fields (zero) and e, in units of `tool_sd`."""
 
 
-class Misfit(eqx.Module):
+class WeightedResiduals(eqx.Module):
     """How a frame's prediction misses what was seen, under a metric."""
 
     squared: Float[Array, ""]
@@ -111,65 +111,67 @@ def grasp_sd(frame: ClosedFrame) -> Float[Array, ""]:
 
 
 def weigh(
-    sheet: Sheet,
+    sheet: PredictedSheet,
     theta: Float[Array, " p"],
     s: Float[Array, " n"],
     frame: ClosedFrame,
-    moment: Moment,
+    moment: FrameContext,
     x: Float[Array, "n 3"],
     noise: Float[Array, "n modes"],
 ) -> Metric:
     """How misfits of a frame weigh at its predicted state x; `noise` are the smooth fields of what is seen [m].
 
-    In two programs, and `glance` too: as one, XLA lays the factor out so that a solve takes half as long again.
+    Two programs, as `normal_equations` is: as one, XLA lays the factor out so that a solve takes half as long again.
     """
     return _metric(*_around(sheet, theta, s, frame, moment, x), frame, noise)
 
 
-def glance(
-    sheet: Sheet,
+def normal_equations(
+    sheet: PredictedSheet,
     metric: Metric,
     theta: Float[Array, " p"],
     directions: Float[Array, "p d"],
     frame: ClosedFrame,
-    moment: Moment,
-) -> Glance:
+    moment: FrameContext,
+) -> NormalEquations:
     """A frame's normal equations where it was weighed."""
     columns, tool = _columns(sheet, metric, theta, directions, frame, moment)
-    return Glance(square=_whole(metric, columns), tool=tool)
+    return NormalEquations(square=_whole(metric, columns), tool=tool)
 
 
 @eqx.filter_jit
 def misfit(
-    sheet: Sheet,
+    sheet: PredictedSheet,
     metric: Metric,
     theta: Float[Array, " p"],
     frame: ClosedFrame,
-    moment: Moment,
+    moment: FrameContext,
     x: Float[Array, "n 3"],
-) -> Misfit:
+) -> WeightedResiduals:
     """Of another prediction x of the same frame."""
     model = sheet.model(theta, moment, frame.way)
     e = metric.forces(frame.y - look(model, x))[:, :, None]
     against = metric.dot(jnp.concatenate([metric.fields, e], axis=2), e, metric.whitened(e))[:, 0]
     tool = beyond_tool(sheet, model, theta, frame, moment, x) / tool_sd(frame)
-    return Misfit(squared=against[-1], fields=against[:-1], tool=tool)
+    return WeightedResiduals(squared=against[-1], fields=against[:-1], tool=tool)
 
 
 @eqx.filter_jit
 def _around(
-    sheet: Sheet,
+    sheet: PredictedSheet,
     theta: Float[Array, " p"],
     s: Float[Array, " n"],
     frame: ClosedFrame,
-    moment: Moment,
+    moment: FrameContext,
     x: Float[Array, "n 3"],
 ) -> tuple[ForceBalance, Frame, Float[Array, "n 3 q"]]:
     """The balance of forces, that linearised at x, and Q."""
     model = sheet.model(theta, moment, frame.way)
     balance = sheet.balance_of(model.energy)
     precision = jnp.where(frame.held[:, None, None], CARRIED * jnp.eye(3)[None], frame.precision)
-    linear = balance.linearise(x, s, Evidence(y=x, precision=precision, held=frame.held, loaded=frame.loaded))
+    linear = balance.linearise(
+        x, s, Evidence(y=x, precision=precision, held=frame.held, force_unknown=frame.force_unknown)
+    )
     return balance, linear, _fields(model.term(TriangleMembrane), sheet.balance.energy.rest, linear.error)
 
 
@@ -199,12 +201,12 @@ def _metric(
 
 @eqx.filter_jit
 def _columns(
-    sheet: Sheet,
+    sheet: PredictedSheet,
     metric: Metric,
     theta: Float[Array, " p"],
     directions: Float[Array, "p d"],
     frame: ClosedFrame,
-    moment: Moment,
+    moment: FrameContext,
 ) -> tuple[Float[Array, "n 3 j"], Float[Array, "3 k"]]:
     """G along some directions, and e; and what the tool says of G, Q and e."""
     balance, linear = metric.balance, metric.frame

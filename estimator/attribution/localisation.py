@@ -18,7 +18,7 @@ def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
         never seen, P(attached) and whether that is more than a half; goes_with: Spearman's correlation of |off| over
         frames and particles with each regressor.
     """
-    frames, rest = list(fitted.glances), np.asarray(problem.history.rest)
+    frames, rest = list(fitted.equations), np.asarray(problem.history.rest)
     off = np.full((len(frames), len(rest), 3), np.nan)
     for row, k in zip(off, frames, strict=True):
         frame = problem.history.frames[k].frame

@@ -4,19 +4,19 @@ import numpy as np
 from jaxtyping import Float
 
 from .closed_frames import ClosedFrame
-from .linear import N_FIELDS, Glance, grasp_sd, tool_sd
+from .linear import N_FIELDS, NormalEquations, grasp_sd, tool_sd
 from .problem import Problem
 
 FIELDS = slice(-1 - N_FIELDS, -1)
 """Where the smooth force fields are in a frame's normal equations."""
 
 
-def reduced(problem: Problem, glances: dict[int, Glance], d: int) -> Float[np.ndarray, "k k"]:
+def reduced(problem: Problem, equations: dict[int, NormalEquations], d: int) -> Float[np.ndarray, "k k"]:
     """Over s, the first d directions and -1."""
     total: np.ndarray | float = 0.0
-    for frames in problem.by_part(glances).values():
-        whole = np.sum([np.asarray(glances[k].square) for k in frames], axis=0)
-        rows = np.array([np.asarray(glances[k].tool) for k in frames])
+    for frames in problem.by_part(equations).values():
+        whole = np.sum([np.asarray(equations[k].square) for k in frames], axis=0)
+        rows = np.array([np.asarray(equations[k].tool) for k in frames])
         n = len(whole) - rows.shape[2]
         whole[n:, n:] += less_offset(rows, problem.history.frames[frames[0]].frame)
         left = np.r_[0 : n + d, len(whole) - 1]

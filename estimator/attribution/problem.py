@@ -9,15 +9,15 @@ from jaxtyping import Float
 
 from ..belief.attachment_belief import AttachmentBelief
 from ..effects.effect import Effect
-from ..effects.sheet_model import centred, undisturbed
+from ..effects.sheet_model import centred, nominal_energy
 from ..filters.build import force_balance
 from ..filters.implicit import prior_belief
 from ..physics.mesh import SheetMesh
-from .closed_frames import History
-from .gather import Gathered
-from .sheet import Sheet
+from .closed_frames import FrameHistory
+from .dataset import Dataset
+from .sheet import PredictedSheet
 
-OWN = {
+NUISANCE = {
     "stretch": (0.05,),
     "bending": (0.3,),
     "friction": (0.05,),
@@ -37,8 +37,8 @@ AMPLITUDE = 0.2
 class Problem:
     """What is fitted to."""
 
-    sheet: Sheet
-    history: History
+    sheet: PredictedSheet
+    history: FrameHistory
     prior: AttachmentBelief
     noise: Float[np.ndarray, "n modes"]
     """Smooth fields of what is seen [m]."""
@@ -50,20 +50,20 @@ class Problem:
     amplitude: float = AMPLITUDE
 
     @classmethod
-    def build(cls, gathered: Gathered, library: tuple[Effect, ...]) -> "Problem":
+    def build(cls, dataset: Dataset, library: tuple[Effect, ...]) -> "Problem":
         """For a recording and what the model may lack."""
-        estimator = gathered.estimator
+        estimator = dataset.estimator
         mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
-        energy = undisturbed(mesh, estimator.declaration)
+        energy = nominal_energy(mesh, estimator.declaration)
         balance = force_balance(mesh, energy, estimator.declaration, estimator.config).widened(FORCE_VARIANCE)
         library = tuple(effect for effect in library if estimator.declaration.hangs or not effect.hanging)
-        sheet = Sheet(balance=balance, view=centred(mesh), library=library)
-        own = {name: sd for name, sd in OWN.items() if any(effect.name == name for effect in library)}
+        sheet = PredictedSheet(balance=balance, view=centred(mesh), library=library)
+        own = {name: sd for name, sd in NUISANCE.items() if any(effect.name == name for effect in library)}
         return cls(
             sheet=sheet,
-            history=History(gathered.frames, mesh.rest),
+            history=FrameHistory(dataset.frames, mesh.rest),
             prior=prior_belief(mesh, reference=float(balance.reference)),
-            noise=gathered.fields,
+            noise=dataset.fields,
             prior_sd=np.concatenate([np.tile(effect.prior_sd, effect.sites) for effect in library]),
             own=np.concatenate([[], *(sheet.place(name) for name in own)]).astype(int),
             own_sd=np.concatenate([[], *(np.asarray(sd) for sd in own.values())]),

@@ -50,15 +50,15 @@ class Score:
 def scores(problem: Problem, fitted: Fitted) -> list[Score]:
     """Every effect of the library that was not fitted already, the likeliest first."""
     n, every = len(fitted.site_precision), directions(problem, np.arange(problem.sheet.size))
-    glances = linearised(problem, fitted.around, fitted.weights, every)
-    square = reduced(problem, glances, problem.sheet.size)
+    equations = linearised(problem, fitted.around, fitted.weights, every)
+    square = reduced(problem, equations, problem.sheet.size)
     left, whole = without_stiffnesses(square, fitted.site_precision), square[n:, n:]
     found = [
         _best([_one(problem, fitted, effect, site, left, whole) for site in range(effect.sites)])
         for effect in problem.sheet.library
         if not np.isin(problem.sheet.place(effect.name), fitted.named).any()
     ]
-    return sorted((_where_natural(problem, fitted, one) for one in found), key=lambda one: -one.log_bayes_factor)
+    return sorted((_from_initial_guesses(problem, fitted, one) for one in found), key=lambda one: -one.log_bayes_factor)
 
 
 def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " named"]]:
@@ -116,14 +116,14 @@ def _one(
     )
 
 
-def _where_natural(problem: Problem, fitted: Fitted, score: Score) -> Score:
+def _from_initial_guesses(problem: Problem, fitted: Fitted, score: Score) -> Score:
     """An effect's score, or that of a few steps from its natural size, where that is more."""
     effect = problem.sheet.effect(score.name)
-    if not effect.natural:
+    if not effect.initial_guesses:
         return score
     at = problem.sheet.place(effect.name, score.site)
-    parts = {problem.history.frames[k].part for k in fitted.glances}
-    begun = [moved(problem, fitted, at, np.array(one)) for one in effect.natural]
+    parts = {problem.history.frames[k].part for k in fitted.equations}
+    begun = [moved(problem, fitted, at, np.array(one)) for one in effect.initial_guesses]
     costs = [cost_under(problem, fitted.weights, point) for point in begun]
     if min(costs) > HOPELESS * fitted.cost:
         return score

@@ -13,99 +13,101 @@ import numpy as np
 
 from .comparison import against, behind, best, not_told_from, outdone
 from .fit import Fitted, fit, moved
+from .hypotheses import COMPARED, ENTER, REMAINDER, FitContext, Hypothesis, fitted_hypotheses, refined, refitted
 from .problem import Problem
 from .scores import bayes_factor
-from .trials import COMPARED, ENTER, REMAINDER, Stage, Trial, fitted_trials, judged, refitted
 
 MOST = 3
 """Effects that are added at most."""
-Say = Callable[[str], None]
-Refused = list[tuple[Trial, str]]
+Log = Callable[[str], None]
+Refused = list[tuple[Hypothesis, str]]
 """Effects, and why not."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Added:
+class AddedHypothesis:
     """An effect, and what else was judged in its place."""
 
-    trial: Trial
-    rivals: list[Trial]
+    hypothesis: Hypothesis
+    rivals: list[Hypothesis]
     """It could not be told from these."""
     others: Refused
     """And these were refused there."""
 
     @property
-    def stage(self) -> Stage:
+    def context(self) -> FitContext:
         """Where the loop is with it."""
-        assert self.trial.left is not None and self.trial.folds is not None
-        return Stage(fitted=self.trial.fitted, left=self.trial.left, folds=self.trial.folds, scores=[])
+        assert self.hypothesis.left is not None and self.hypothesis.folds is not None
+        return FitContext(
+            fitted=self.hypothesis.fitted, left=self.hypothesis.left, folds=self.hypothesis.folds, scores=[]
+        )
 
 
 def following(
-    problem: Problem, stage: Stage, added: list[Added], used: set[int], say: Say
-) -> tuple[list[Added], Refused]:
+    problem: Problem, context: FitContext, added: list[AddedHypothesis], used: set[int], log: Log
+) -> tuple[list[AddedHypothesis], Refused]:
     """What there is in the model after a stage, and what is refused by itself; nothing new where nothing helps.
 
     An effect, which knows itself what was refused in its place; or two, where much is left over, none helps by itself,
     and another does beside one that was refused here, or in the place of the last.
     """
-    accepted = [one.trial for one in added]
-    passed, refused = _tried(problem, stage, [(stage, 0.0)], accepted, used, say)
+    accepted = [one.hypothesis for one in added]
+    passed, refused = _tried(problem, context, [(context, 0.0)], accepted, used, log)
     if passed:
         return [*added, _chosen(passed, refused)], []
-    if stage.left.gain > REMAINDER:
+    if context.left.gain > REMAINDER:
         starts = [(added, [one for one, _ in refused], 0.0)]
         starts += [(added[:-1], _else(added[-1]), -accepted[-1].log_bayes_factor)] if added else []
         for before, firsts, head_start in starts:
-            if two := _two(problem, stage, before, firsts, head_start, used, say):
+            if two := _two(problem, context, before, firsts, head_start, used, log):
                 return [*before, *two], refused
     return added, refused
 
 
-def revised(problem: Problem, added: list[Added], used: set[int], say: Say) -> list[Added]:
+def revised(problem: Problem, added: list[AddedHypothesis], used: set[int], log: Log) -> list[AddedHypothesis]:
     """Each but the last compared again with what was tried in its place; dropped where it is not needed any more."""
     for k in range(len(added) - 1):
         one, rest = added[k], [*added[:k], *added[k + 1 :]]
-        names = [other.trial.effect.name for other in rest]
-        say(f"{one.trial.effect.name} again, beside {' and '.join(names)}")
-        others = [trial for trial in _else(one) if trial.effect.name not in names]
-        plain, trials = _beside(problem, added[-1].trial, one.trial, others, used, say)
-        needed = [trial for trial in trials if trial.log_bayes_factor > ENTER]
+        names = [other.hypothesis.effect.name for other in rest]
+        log(f"{one.hypothesis.effect.name} again, beside {' and '.join(names)}")
+        others = [hypothesis for hypothesis in _else(one) if hypothesis.effect.name not in names]
+        plain, hypotheses = _beside(problem, added[-1].hypothesis, one.hypothesis, others, used, log)
+        needed = [hypothesis for hypothesis in hypotheses if hypothesis.log_bayes_factor > ENTER]
         if not needed:
-            say(f"{one.trial.effect.name} dropped")
-            last = judged(problem, refitted(problem, rest[-1].trial, plain), used, say)
+            log(f"{one.hypothesis.effect.name} dropped")
+            last = refined(problem, refitted(problem, rest[-1].hypothesis, plain), used, log)
             rest = rest[:k] + [_without(one, other) for other in rest[k:]]
-            return [replace(other, trial=_with(other.trial, last)) for other in rest]
+            return [replace(other, hypothesis=_with(other.hypothesis, last)) for other in rest]
         again = _chosen(needed, [pair for pair in one.others if pair[0] not in others])
-        rest = [replace(other, trial=_with(other.trial, again.trial)) for other in rest]
+        rest = [replace(other, hypothesis=_with(other.hypothesis, again.hypothesis)) for other in rest]
         added = [*rest[:k], again, *rest[k:]]
     return added
 
 
 def _tried(
     problem: Problem,
-    stage: Stage,
-    yardsticks: list[tuple[Stage, float]],
-    accepted: list[Trial],
+    context: FitContext,
+    yardsticks: list[tuple[FitContext, float]],
+    accepted: list[Hypothesis],
     used: set[int],
-    say: Say,
-) -> tuple[list[Trial], Refused]:
+    log: Log,
+) -> tuple[list[Hypothesis], Refused]:
     """Effects added to a stage that are better than other stages, and those that are not.
 
     Than each of these the stage is likelier by a head start [nat]. Until one is better, none is added in place of a far
     likelier one.
     """
-    passed: list[Trial] = []
+    passed: list[Hypothesis] = []
     refused: Refused = []
-    for trial in fitted_trials(problem, stage, accepted, used, say):
-        if passed and trial.log_bayes_factor < COMPARED * passed[0].log_bayes_factor:
+    for hypothesis in fitted_hypotheses(problem, context, accepted, used, log):
+        if passed and hypothesis.log_bayes_factor < COMPARED * passed[0].log_bayes_factor:
             break
-        tried = judged(problem, trial, used, say)
+        tried = refined(problem, hypothesis, used, log)
         whys = [against(tried, yardstick, head_start) for yardstick, head_start in yardsticks]
         whys += [] if passed else [outdone(tried, [other for other, _ in refused])]
         if why := next(filter(None, whys), None):
             refused.append((tried, why))
-            say(f"{trial.effect.name} refused: {why}")
+            log(f"{hypothesis.effect.name} refused: {why}")
         else:
             passed.append(tried)
     return passed, refused
@@ -113,75 +115,75 @@ def _tried(
 
 def _two(
     problem: Problem,
-    yardstick: Stage,
-    before: list[Added],
-    firsts: list[Trial],
+    yardstick: FitContext,
+    before: list[AddedHypothesis],
+    firsts: list[Hypothesis],
     head_start: float,
     used: set[int],
-    say: Say,
-) -> list[Added]:
+    log: Log,
+) -> list[AddedHypothesis]:
     """The likeliest of some effects with another beside it, if both are better than a yardstick and than it alone."""
     firsts = [one for one in firsts if one.sensible]
     if not firsts or len(before) + 2 > MOST:
         return []
     first = max(firsts, key=lambda one: one.log_bayes_factor)
-    say(f"looking beside {first.effect.name}")
-    one = Added(
-        trial=first, rivals=[], others=[(other, behind(other, first)) for other in firsts if other is not first]
+    log(f"looking beside {first.effect.name}")
+    one = AddedHypothesis(
+        hypothesis=first, rivals=[], others=[(other, behind(other, first)) for other in firsts if other is not first]
     )
-    accepted = [*(other.trial for other in before), first]
-    yardsticks = [(yardstick, first.log_bayes_factor + head_start), (one.stage, 0.0)]
-    passed, _ = _tried(problem, one.stage, yardsticks, accepted, used, say)
+    accepted = [*(other.hypothesis for other in before), first]
+    yardsticks = [(yardstick, first.log_bayes_factor + head_start), (one.context, 0.0)]
+    passed, _ = _tried(problem, one.context, yardsticks, accepted, used, log)
     return [one, _chosen(passed, [])] if passed else []
 
 
-def _chosen(passed: list[Trial], refused: Refused) -> Added:
+def _chosen(passed: list[Hypothesis], refused: Refused) -> AddedHypothesis:
     chosen = best(passed)
     rivals = [one for one in passed if one is not chosen and not_told_from(one, chosen)]
     fell_behind = [one for one in passed if one is not chosen and one not in rivals]
     others = refused + [(one, behind(one, chosen)) for one in fell_behind]
-    return Added(trial=chosen, rivals=rivals, others=others)
+    return AddedHypothesis(hypothesis=chosen, rivals=rivals, others=others)
 
 
-def _else(added: Added) -> list[Trial]:
+def _else(added: AddedHypothesis) -> list[Hypothesis]:
     """What may stand in an effect's place."""
-    likely = COMPARED * added.trial.log_bayes_factor
-    trials = [*added.rivals, *(one for one, _ in added.others)]
-    return [one for one in trials if one.sensible and one.log_bayes_factor > likely]
+    likely = COMPARED * added.hypothesis.log_bayes_factor
+    hypotheses = [*added.rivals, *(one for one, _ in added.others)]
+    return [one for one in hypotheses if one.sensible and one.log_bayes_factor > likely]
 
 
-def _without(dropped: Added, later: Added) -> Added:
+def _without(dropped: AddedHypothesis, later: AddedHypothesis) -> AddedHypothesis:
     """An effect without one before it that was dropped: from which it was not told, so neither is that from it.
 
     What it was not told from beside that one stands only if it was in question in that one's place too.
     """
-    in_question = [trial.effect.name for trial in _else(dropped)]
+    in_question = [hypothesis.effect.name for hypothesis in _else(dropped)]
     rivals = [rival for rival in later.rivals if rival.effect.name in in_question]
-    if later.trial.effect.name in [rival.effect.name for rival in dropped.rivals]:
-        rivals.append(dropped.trial)
+    if later.hypothesis.effect.name in [rival.effect.name for rival in dropped.rivals]:
+        rivals.append(dropped.hypothesis)
     return replace(later, rivals=rivals)
 
 
 def _beside(
-    problem: Problem, last: Trial, one: Trial, others: list[Trial], used: set[int], say: Say
-) -> tuple[Fitted, list[Trial]]:
+    problem: Problem, last: Hypothesis, one: Hypothesis, others: list[Hypothesis], used: set[int], log: Log
+) -> tuple[Fitted, list[Hypothesis]]:
     """The last fit without an effect, and with each of those that may stand in its place."""
     named = last.fitted.named[~np.isin(last.fitted.named, one.at)]
     plain = fit(problem, named, moved(problem, last.fitted, one.at, np.zeros(len(one.at))), used)
-    trials = []
-    for trial in [one, *others]:
-        if trial is one:
-            found = _with(trial, last)
+    hypotheses = []
+    for hypothesis in [one, *others]:
+        if hypothesis is one:
+            found = _with(hypothesis, last)
         else:
-            point = moved(problem, plain, trial.at, trial.theta)
-            fitted = fit(problem, np.append(named, trial.at), point, used)
-            found = judged(problem, refitted(problem, trial, fitted), used, say)
-        gain = bayes_factor(problem, found.fitted, plain, trial.effect.sites)[1]
-        say(f"{trial.effect.name}: {gain:.1f} nat beside the others")
-        trials.append(replace(found, log_bayes_factor=gain))
-    return plain, trials
+            point = moved(problem, plain, hypothesis.at, hypothesis.theta)
+            fitted = fit(problem, np.append(named, hypothesis.at), point, used)
+            found = refined(problem, refitted(problem, hypothesis, fitted), used, log)
+        gain = bayes_factor(problem, found.fitted, plain, hypothesis.effect.sites)[1]
+        log(f"{hypothesis.effect.name}: {gain:.1f} nat beside the others")
+        hypotheses.append(replace(found, log_bayes_factor=gain))
+    return plain, hypotheses
 
 
-def _with(one: Trial, last: Trial) -> Trial:
+def _with(one: Hypothesis, last: Hypothesis) -> Hypothesis:
     """An effect as a later fit has it."""
     return replace(one, fitted=last.fitted, sds=last.sds, left=last.left, folds=last.folds)

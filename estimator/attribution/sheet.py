@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..effects.effect import Effect
-from ..effects.sheet_model import Moment, SheetModel, View, tangents
+from ..effects.sheet_model import FrameContext, SheetModel, View, tangents
 from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
-from ..parallel_map import side_by_side
+from ..parallel_map import parallel_map
 from ..physics.energy import SheetEnergy
 from ..physics.membrane import TriangleMembrane
-from .closed_frames import ClosedFrame, History
+from .closed_frames import ClosedFrame, FrameHistory
 
 GRIPPED = 1e6
 """Precision with which the grip carries what it holds while a state is predicted [1/m^2]."""
@@ -21,7 +21,7 @@ ROUNDS, STAYS = 4, 1e-5
 """How often a frame is predicted at most with an effect that lingers, and how little it moves when it stays [m]."""
 
 
-class Sheet(eqx.Module):
+class PredictedSheet(eqx.Module):
     """One sheet and what it may lack."""
 
     balance: ForceBalance
@@ -47,11 +47,11 @@ class Sheet(eqx.Module):
             start += effect.size
         raise ValueError(f"there is no effect {name!r}; there are {[one.name for one in self.library]}.")
 
-    def plain(self, moment: Moment, way: Float[Array, " 3"]) -> SheetModel:
+    def plain(self, moment: FrameContext, way: Float[Array, " 3"]) -> SheetModel:
         """Of one frame, without any."""
         return SheetModel(energy=self.balance.energy, tool=way, view=self.view, time=moment.time)
 
-    def model(self, theta: Float[Array, " p"], moment: Moment, way: Float[Array, " 3"]) -> SheetModel:
+    def model(self, theta: Float[Array, " p"], moment: FrameContext, way: Float[Array, " 3"]) -> SheetModel:
         """Of one frame, with effects of those sizes."""
         model, start = self.plain(moment, way), 0
         for effect in self.library:
@@ -71,21 +71,23 @@ def look(model: SheetModel, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     return model.view(x, tangents=tangents(model.term(TriangleMembrane), x))
 
 
-def closed_on(sheet: Sheet, theta: Float[Array, " p"], frame: ClosedFrame, moment: Moment) -> Float[Array, "n 3"]:
+def closed_on(
+    sheet: PredictedSheet, theta: Float[Array, " p"], frame: ClosedFrame, moment: FrameContext
+) -> Float[Array, "n 3"]:
     """Where the jaws closed on the held particles, the errors that the view had then taken off [m]."""
     then = (moment.time - moment.closed, jnp.zeros_like(moment.closed))
     model = sheet.model(theta, eqx.tree_at(lambda m: (m.time, m.closed), moment, then), frame.way)
     along = tangents(model.term(TriangleMembrane), moment.rest)
     slid = model.view.followed(moment.rest, along) - moment.rest
-    return 2 * frame.turned - model.view.moved(frame.turned + slid)
+    return 2 * frame.rotated - model.view.moved(frame.rotated + slid)
 
 
 def beyond_tool(
-    sheet: Sheet,
+    sheet: PredictedSheet,
     model: SheetModel,
     theta: Float[Array, " p"],
     frame: ClosedFrame,
-    moment: Moment,
+    moment: FrameContext,
     x: Float[Array, "n 3"],
 ) -> Float[Array, " 3"]:
     """By how much the held particles have gone further than the tool [m].
@@ -121,11 +123,11 @@ class Predicted(eqx.Module):
 
 @eqx.filter_jit
 def predict(
-    sheet: Sheet,
+    sheet: PredictedSheet,
     theta: Float[Array, " p"],
     s: Float[Array, " n"],
     frame: ClosedFrame,
-    moment: Moment,
+    moment: FrameContext,
     start: Float[Array, "n 3"],
     by_tool: Bool[Array, ""],
 ) -> Predicted:
@@ -135,17 +137,17 @@ def predict(
     told = by_tool & ~frame.by_points
     to = closed + jnp.where(told, model.tool, held_way(model, frame, closed, start))[None]
     precision = jnp.broadcast_to(GRIPPED * jnp.eye(3)[None], (len(s), 3, 3))
-    gripped = Evidence(y=to, precision=precision, held=frame.held, loaded=frame.loaded)
+    gripped = Evidence(y=to, precision=precision, held=frame.held, force_unknown=frame.force_unknown)
     begun = jnp.where(frame.held[:, None], to, start)
     x = sheet.balance_of(model.energy).predict(begun, s, gripped)
     return Predicted(x=x, seen=look(model, x))
 
 
 def predict_all(
-    sheet: Sheet,
+    sheet: PredictedSheet,
     theta: np.ndarray,
     s: np.ndarray,
-    history: History,
+    history: FrameHistory,
     states: Float[np.ndarray, "frames n 3"],
     *,
     only: list[int] | None = None,
@@ -158,7 +160,9 @@ def predict_all(
     """
     grasps = history.by(lambda one: one.grasp, range(len(history.frames)) if only is None else only)
     found, seen = states.copy(), np.full(states.shape, np.nan)
-    rounds = ROUNDS if any(one.lingers and np.any(theta[sheet.place(one.name)]) for one in sheet.library) else 1
+    rounds = (
+        ROUNDS if any(one.history_dependent and np.any(theta[sheet.place(one.name)]) for one in sheet.library) else 1
+    )
     at, stiffnesses, told = jnp.asarray(theta), jnp.asarray(s), jnp.asarray(by_tool)
 
     def one(grasp: int) -> None:
@@ -173,5 +177,5 @@ def predict_all(
                 if stays:
                     break
 
-    side_by_side(one, grasps)
+    parallel_map(one, grasps)
     return found, seen

@@ -17,11 +17,11 @@ from jaxtyping import Array, Float
 
 from ..physics.mesh import far_apart
 from ..planning.information_policy import PLACES, SLANTED, UP
-from .closed_frames import USUAL_GAP, ClosedFrame, History, Timed
+from .closed_frames import USUAL_GAP, ClosedFrame, FrameHistory, Timed
 from .closing import Closed
+from .dataset import Dataset
 from .every_frame import cost_under, weighed
 from .fit import Fitted
-from .gather import Gathered
 from .held_out import from_rest
 from .problem import Point, Problem
 from .sheet import look
@@ -55,19 +55,19 @@ class Suggestion:
         return self.expected > ENOUGH
 
 
-def suggest(closed: Closed, gathered: Gathered, *, say: Callable[[str], None] = lambda _: None) -> Suggestion | None:
+def suggest(closed: Closed, dataset: Dataset, *, log: Callable[[str], None] = lambda _: None) -> Suggestion | None:
     """Of the pulls that are tried, the one that is expected to tell most; None if there is nothing to tell apart."""
     open_ = [[best, *rivals] for best, rivals in zip(closed.accepted, closed.rivals, strict=True) if rivals]
     if not open_:
         return None
-    trials = open_[-1]
-    fits, names = [one.fitted for one in trials], tuple(one.effect.name for one in trials)
-    say(f"looking for a pull that tells {', '.join(names)} apart")
-    rest, far, gap, radius = gathered.estimator.sheet.rest, *_usual(gathered)
+    hypotheses = open_[-1]
+    fits, names = [one.fitted for one in hypotheses], tuple(one.effect.name for one in hypotheses)
+    log(f"looking for a pull that tells {', '.join(names)} apart")
+    rest, far, gap, radius = dataset.estimator.sheet.rest, *_usual(dataset)
     places = far_apart(rest, PLACES).tolist()
 
     def tried(place: int, direction: Float[np.ndarray, " 3"]) -> tuple[float, int, Float[np.ndarray, " 3"]]:
-        frames = _frames(gathered, place, far * direction, gap=gap, radius=radius)
+        frames = _frames(dataset, place, far * direction, gap=gap, radius=radius)
         return told_apart(closed.problem, fits, frames), place, far * direction
 
     best = sorted((tried(place, UP[0]) for place in places), key=lambda one: -one[0])
@@ -85,7 +85,7 @@ def told_apart(problem: Problem, fits: list[Fitted], frames: list[Timed]) -> flo
 def _shown(problem: Problem, fitted: Fitted, frames: list[Timed]) -> list[Timed]:
     """The frames as they would be seen if a fit were right."""
     lying = _lying(_of(problem, frames), fitted)
-    frames = [replace(one, frame=eqx.tree_at(lambda f: (f.y, f.turned), one.frame, (lying, lying))) for one in frames]
+    frames = [replace(one, frame=eqx.tree_at(lambda f: (f.y, f.rotated), one.frame, (lying, lying))) for one in frames]
     told = [replace(one, frame=eqx.tree_at(lambda f: f.by_points, one.frame, jnp.asarray(False))) for one in frames]
     seen = _predicted(_of(problem, told), fitted, by_tool=True).seen
     return [
@@ -118,13 +118,13 @@ def _against(problem: Problem, fitted: Fitted, frames: list[Timed]) -> float:
 
 
 def _of(problem: Problem, frames: list[Timed]) -> Problem:
-    return replace(problem, history=History(frames, np.asarray(problem.history.rest)))
+    return replace(problem, history=FrameHistory(frames, np.asarray(problem.history.rest)))
 
 
-def _frames(gathered: Gathered, place: int, pull: Float[np.ndarray, " 3"], *, gap: float, radius: float) -> list[Timed]:
+def _frames(dataset: Dataset, place: int, pull: Float[np.ndarray, " 3"], *, gap: float, radius: float) -> list[Timed]:
     """The jaws closed on a place, half of the pull, all of it, and after the hold; what is seen is left open."""
-    rest = gathered.estimator.sheet.rest
-    last, like = gathered.frames[-1], gathered.frames[-1].frame
+    rest = dataset.estimator.sheet.rest
+    last, like = dataset.frames[-1], dataset.frames[-1].frame
     held = np.linalg.norm(rest - rest[place], axis=1) <= radius
     precision = jnp.broadcast_to(jnp.max(like.precision, axis=0)[None], like.precision.shape)
     grasp, began = last.grasp + 1, last.time + HOLD
@@ -136,8 +136,8 @@ def _frames(gathered: Gathered, place: int, pull: Float[np.ndarray, " 3"], *, ga
                 visible=jnp.ones(len(rest), dtype=bool),
                 precision=precision,
                 held=jnp.asarray(held),
-                loaded=jnp.asarray(gathered.estimator.loaded(held)),
-                turned=jnp.asarray(rest),
+                force_unknown=jnp.asarray(dataset.estimator.force_unknown(held)),
+                rotated=jnp.asarray(rest),
                 way=jnp.asarray(share * pull),
                 by_points=like.by_points,
                 held_sd=like.held_sd,
@@ -154,9 +154,9 @@ def _frames(gathered: Gathered, place: int, pull: Float[np.ndarray, " 3"], *, ga
     ]
 
 
-def _usual(gathered: Gathered) -> tuple[float, float, float]:
+def _usual(dataset: Dataset) -> tuple[float, float, float]:
     """How far the tool goes at most [m], what lies between frames of a grasp [s], and how wide the jaws hold [m]."""
-    rest, frames = gathered.estimator.sheet.rest, gathered.frames
+    rest, frames = dataset.estimator.sheet.rest, dataset.frames
     gaps = [b.time - a.time for a, b in pairwise(frames) if a.grasp == b.grasp]
     grips = [rest[np.asarray(one.frame.held)] for one in frames]
     return (

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..effects import LIBRARY
 from ..effects.effect import Effect
-from ..effects.sheet_model import Moment, SheetModel
+from ..effects.sheet_model import FrameContext, SheetModel
 from .problem import Problem
 from .sheet import look
 
@@ -30,7 +30,7 @@ def check_effects(problem: Problem) -> None:
             _check(effect, plain, moment, jnp.asarray(states[last]))
 
 
-def _check(effect: Effect, plain: SheetModel, moment: Moment, x: jax.Array) -> None:
+def _check(effect: Effect, plain: SheetModel, moment: FrameContext, x: jax.Array) -> None:
     zero = jnp.zeros(effect.size)
     try:
         changed = effect.acts(plain, zero, moment)
@@ -57,5 +57,5 @@ def _check(effect: Effect, plain: SheetModel, moment: Moment, x: jax.Array) -> N
     if not np.isfinite(derivative).all():
         bad = np.flatnonzero(~np.isfinite(derivative).all(axis=0)).tolist()
         raise ValueError(f"Effect {effect.name}: no finite derivative at 0 along the parameters {bad}.")
-    if not (derivative.any() or effect.natural):
+    if not (derivative.any() or effect.initial_guesses):
         raise ValueError(f"Effect {effect.name} changes neither forces, anchors, tool nor view to first order.")

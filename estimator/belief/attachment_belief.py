@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..physics.block_tridiagonal import lower_inverse
 from .attachment_prior import AttachmentPrior
-from .attachment_sampler import Sampled, Sampler
+from .attachment_sampler import PosteriorSamples, Sampler
 from .boundary_belief import entropy
 from .spike_and_slab import Mixture
 
@@ -158,7 +158,7 @@ class AttachmentBelief(eqx.Module):
         state = jnp.where(mixture.attached > 0.5, 1 + jnp.argmax(mixture.weight[1:], axis=0), 0)
         return Sampler(prior=self.prior, precision=self.precision, shift=self.shift), state
 
-    def _saying(self, found: Sampled) -> "AttachmentBelief":
+    def _saying(self, found: PosteriorSamples) -> "AttachmentBelief":
         """Sites and messages that give what was sampled."""
 
         def narrower(_, sites):
@@ -168,9 +168,9 @@ class AttachmentBelief(eqx.Module):
         sites = jax.lax.fori_loop(0, MATCHES, narrower, jnp.clip(1 / found.variance, *SITE_PRECISION))
         shift = self.precision @ found.mean + sites * found.mean - self.shift
         belief = eqx.tree_at(
-            lambda belief: (belief.site_precision, belief.site_shift, belief.prior.stiffness.whole),
+            lambda belief: (belief.site_precision, belief.site_shift, belief.prior.stiffness.weights),
             self,
-            (sites, shift, found.whole),
+            (sites, shift, found.weights),
         )
         _, factor = belief._mixture(*belief._cavity(belief.gaussian()))
         beside = self.prior.neighbours < len(self.shift)

@@ -22,7 +22,7 @@ from ..physics.block_tridiagonal import lower_inverse
 from .attachment_prior import AttachmentPrior
 
 
-class Sampled(eqx.Module):
+class PosteriorSamples(eqx.Module):
     """Averages over the sweeps."""
 
     weight: Float[Array, "c n"]
@@ -30,8 +30,8 @@ class Sampled(eqx.Module):
     mean: Float[Array, " n"]
     """Of s."""
     variance: Float[Array, " n"]
-    whole: Float[Array, " _rungs"]
-    """See `SpikeAndSlab.whole`."""
+    weights: Float[Array, " _components"]
+    """See `SpikeAndSlab.weights`."""
     agree: Bool[Array, ""]
     """Whether the first half of the sweeps says the same of P(attached) as the second."""
 
@@ -52,7 +52,7 @@ class Sampler(eqx.Module):
         burn_in: int,
         rounds: int | Int[Array, ""],
         doublings: int | Int[Array, ""] = 1,
-    ) -> Sampled:
+    ) -> PosteriorSamples:
         """Average rounds of `ROUND` sweeps from a state, leaving out the first `burn_in`.
 
         After `rounds` of them come as many again; and then as many as all so far again, until both halves agree, with
@@ -66,7 +66,9 @@ class Sampler(eqx.Module):
             state, moments, weight = self._sweep(state, moments, stiffness.share, one)
             stiffness, mean = stiffness.drawn(state, other), moments.mean
             squared = jnp.diagonal(moments.covariance) + mean**2
-            sums = jax.tree.map(jnp.add, sums, Sums(weight=weight, mean=mean, squared=squared, whole=stiffness.whole))
+            sums = jax.tree.map(
+                jnp.add, sums, Sums(weight=weight, mean=mean, squared=squared, weights=stiffness.weights)
+            )
             return state, moments, stiffness, sums
 
         def round(k, carried):
@@ -93,11 +95,11 @@ class Sampler(eqx.Module):
         _, _, sums, _, _, agree = jax.lax.while_loop(unsettled, again, first)
         sweeps = jnp.sum(sums.weight[:, 0])
         mean = sums.mean / sweeps
-        return Sampled(
+        return PosteriorSamples(
             weight=sums.weight / jnp.sum(sums.weight, axis=0)[None],
             mean=mean,
             variance=sums.squared / sweeps - mean**2,
-            whole=sums.whole / sweeps,
+            weights=sums.weights / sweeps,
             agree=agree,
         )
 
@@ -135,7 +137,7 @@ class Sampler(eqx.Module):
         self,
         state: Int[Array, " n"],
         moments: "Moments",
-        share: Float[Array, " _rungs"],
+        share: Float[Array, " _components"],
         key: PRNGKeyArray,
         *,
         warm: bool = True,
@@ -191,17 +193,17 @@ class Sampler(eqx.Module):
 
 
 class Sums(eqx.Module):
-    """Over sweeps, of what `Sampled` averages."""
+    """Over sweeps, of what `PosteriorSamples` averages."""
 
     weight: Float[Array, "c n"]
     mean: Float[Array, " n"]
     squared: Float[Array, " n"]
-    whole: Float[Array, " _rungs"]
+    weights: Float[Array, " _components"]
 
     @classmethod
     def none(cls, c: int, n: int) -> "Sums":
         """Over no sweep, of n particles in c states."""
-        return cls(weight=jnp.zeros((c, n)), mean=jnp.zeros(n), squared=jnp.zeros(n), whole=jnp.zeros(c - 1))
+        return cls(weight=jnp.zeros((c, n)), mean=jnp.zeros(n), squared=jnp.zeros(n), weights=jnp.zeros(c - 1))
 
     @property
     def attached(self) -> Float[Array, " n"]:

@@ -69,34 +69,35 @@ class SpikeAndSlab(eqx.Module):
     mean: Float[Array, " c"]
     """Of each normal before it is cut off; 0 for the spike, the first."""
     sd: Float[Array, " c"]
-    whole: Float[Array, " _rungs"]
+    weights: Float[Array, " _components"]
     """Share of each rung among attachments before they are parted."""
-    parting: Float[Array, "_rungs _rungs"]
+    border_kernel: Float[Array, "_components _components"]
     """Share of each rung (row) among particles whose attachment, if they had all of it, were on another (column)."""
-    even: Float[Array, ""]
+    dirichlet_strength: Float[Array, ""]
     """How many attached particles the even shares are worth, from which learning starts."""
 
     @classmethod
     def build(
-        cls, *, spike: float, rungs: tuple[float, ...], spread: float, even: float, partial: float
+        cls, *, spike: float, components: tuple[float, ...], spread: float, dirichlet_strength: float, partial: float
     ) -> "SpikeAndSlab":
-        """For a spike of width `spike` and rungs at the given s, each as wide as `spread` times its s.
+        """For a spike of width `spike` and components at the given s, each as wide as `spread` times its s.
 
         `partial` is the share of attached particles that have a part, as likely any as another, of their attachment.
         """
-        centre = jnp.asarray(rungs, dtype=float)
+        centre = jnp.asarray(components, dtype=float)
         return cls(
             mean=jnp.concatenate([jnp.zeros(1), centre]),
             sd=jnp.concatenate([jnp.full(1, spike), spread * centre]),
-            whole=jnp.full(len(rungs), 1 / len(rungs)),
-            parting=(1 - partial) * jnp.eye(len(rungs)) + partial * jnp.asarray(_parted(np.asarray(rungs))),
-            even=jnp.asarray(even, dtype=float),
+            weights=jnp.full(len(components), 1 / len(components)),
+            border_kernel=(1 - partial) * jnp.eye(len(components))
+            + partial * jnp.asarray(_parted(np.asarray(components))),
+            dirichlet_strength=jnp.asarray(dirichlet_strength, dtype=float),
         )
 
     @property
-    def share(self) -> Float[Array, " _rungs"]:
+    def share(self) -> Float[Array, " _components"]:
         """Of each rung among attached particles."""
-        return self.parting @ self.whole
+        return self.border_kernel @ self.weights
 
     def learned(self, mixture: "Mixture", factor: Float[Array, " n"]) -> "SpikeAndSlab":
         """Shares moved towards those expected after counting the particles likelier attached than not.
@@ -107,18 +108,18 @@ class SpikeAndSlab(eqx.Module):
         """
         counted = (mixture.attached > 0.5) & (factor > 0)
         count = jnp.sum(jnp.where(counted, mixture.weight[1:], 0.0), axis=1)
-        count = self.whole * (self.parting.T @ (count / self.share))
-        whole = (self.even / len(count) + count) / (self.even + jnp.sum(count))
-        return eqx.tree_at(lambda prior: prior.whole, self, (1 - LEARNED) * self.whole + LEARNED * whole)
+        count = self.weights * (self.border_kernel.T @ (count / self.share))
+        weights = (self.dirichlet_strength / len(count) + count) / (self.dirichlet_strength + jnp.sum(count))
+        return eqx.tree_at(lambda prior: prior.weights, self, (1 - LEARNED) * self.weights + LEARNED * weights)
 
     def drawn(self, state: Int[Array, " n"], key: PRNGKeyArray) -> "SpikeAndSlab":
         """Shares drawn from what is known of them given each particle's state: 0 is free, k on the k-th rung."""
         by_part, by_share = jax.random.split(key)
-        parted = jnp.log(self.whole)[None] + jnp.log(self.parting[jnp.maximum(state - 1, 0)])
+        parted = jnp.log(self.weights)[None] + jnp.log(self.border_kernel[jnp.maximum(state - 1, 0)])
         of = jnp.where(state > 0, 1 + jax.random.categorical(by_part, parted, axis=1), 0)
         count = jnp.zeros(len(self.mean)).at[of].add(1.0)[1:]
-        whole = jax.random.dirichlet(by_share, self.even / len(count) + count) + RARE
-        return eqx.tree_at(lambda prior: prior.whole, self, whole)
+        weights = jax.random.dirichlet(by_share, self.dirichlet_strength / len(count) + count) + RARE
+        return eqx.tree_at(lambda prior: prior.weights, self, weights)
 
     def posterior(
         self, mean: Float[Array, " n"], variance: Float[Array, " n"], log_odds: Float[Array, " n"]
@@ -136,16 +137,16 @@ class SpikeAndSlab(eqx.Module):
         parts = Mixture(weight=narrowed, mean=narrowed * (mean / variance + centre / width), sd=jnp.sqrt(narrowed))
         seen = norm.logpdf(mean, centre, jnp.sqrt(variance + width))
         evidence = seen + _cut_off(parts.mean, parts.sd) - _cut_off(centre, self.sd[:, None])
-        rungs = evidence[1:] + jnp.log(self.share)[:, None]
-        factor = logsumexp(rungs, axis=0) - evidence[0]
+        components = evidence[1:] + jnp.log(self.share)[:, None]
+        factor = logsumexp(components, axis=0) - evidence[0]
         attached = jax.nn.sigmoid(log_odds + factor)[None]
-        weight = jnp.concatenate([1 - attached, attached * jax.nn.softmax(rungs, axis=0)])
+        weight = jnp.concatenate([1 - attached, attached * jax.nn.softmax(components, axis=0)])
         return eqx.tree_at(lambda parts: parts.weight, parts, weight), factor
 
 
-def _parted(rungs: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r r"]:
+def _parted(components: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r r"]:
     """Probability of being nearest to each rung (row), in the logarithm of b, for any part of the b of another."""
-    b = rungs / np.maximum(1 - rungs, 1e-9)
+    b = components / np.maximum(1 - components, 1e-9)
     between = np.concatenate([[0], np.sqrt(b[1:] * b[:-1]), [np.inf]])
     return np.diff(np.minimum(between[:, None] / b[None], 1), axis=0)
 

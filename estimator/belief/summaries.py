@@ -6,33 +6,33 @@ from jiggle_mj.estimate import Belief, Detection
 from jiggle_mj.observation import Declaration
 
 from ..config import EstimatorConfig
-from ..filters.evidence import Filter, Stated
+from ..filters.evidence import Filter, PosteriorSummary
 from .boundary_belief import BoundaryBelief
 
 RULE = "P(attached) > 0.5"
 """Of filters that state a probability."""
 
 
-def belief(stated: Stated) -> Belief:
+def belief(summary: PosteriorSummary) -> Belief:
     """Mean, covariance and, of beliefs in a bounded stiffness, intervals."""
-    mean, covariance = stated.belief.moments()
-    if isinstance(stated.belief, BoundaryBelief):
+    mean, covariance = summary.belief.moments()
+    if isinstance(summary.belief, BoundaryBelief):
         return Belief(mean=np.asarray(mean), covariance=np.asarray(covariance))
-    lower, upper = stated.belief.interval()
+    lower, upper = summary.belief.interval()
     return Belief(
         mean=np.asarray(mean),
         covariance=np.asarray(covariance),
-        reference=float(stated.belief.reference),
+        reference=float(summary.belief.reference),
         lower=np.asarray(lower),
         upper=np.asarray(upper),
     )
 
 
 def detection(
-    stated: Stated, filter: Filter, declaration: Declaration, config: EstimatorConfig, *, converged: bool
+    summary: PosteriorSummary, filter: Filter, declaration: Declaration, config: EstimatorConfig, *, converged: bool
 ) -> Detection:
     """By P(attached) where it is stated, else by the mean; `converged`: whether samples, at the end, agreed."""
-    b, sd, probability = (np.asarray(one) for one in (stated.b, stated.sd, stated.probability))
+    b, sd, probability = (np.asarray(one) for one in (summary.b, summary.sd, summary.probability))
     if np.isfinite(probability).all():
         noise = filter.noise
         return Detection(

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from jaxtyping import Array, Float
 
-from .sheet_model import Moment, SheetModel
+from .sheet_model import FrameContext, SheetModel
 
-Acts = Callable[[SheetModel, Float[Array, " p"], Moment], SheetModel]
+Acts = Callable[[SheetModel, Float[Array, " p"], FrameContext], SheetModel]
 """The model of one frame with the effect in it, for parameters and what may be known of the frame; differentiable."""
 
 
@@ -28,7 +28,7 @@ class Effect:
     sites: int = 1
     """At how many places, or in how many directions, it may be, at one of them alone; `acts` takes the parameters of
     all of them, one site after the other."""
-    natural: tuple[tuple[float, ...], ...] = ()
+    initial_guesses: tuple[tuple[float, ...], ...] = ()
     """Parameters from which a fit may begin, for an effect that shows little of itself in its derivatives at 0."""
     source: str
     """Where the prior's scale comes from."""
@@ -36,8 +36,8 @@ class Effect:
     """Effects that often look like it, and attachments that do."""
     non_negative: bool = False
     """Whether parameters below 0 make no sense."""
-    lingers: bool = False
-    """Whether it depends on where the sheet is in the frame itself by `Moment.past`: predicted until that stays."""
+    history_dependent: bool = False
+    """Whether it depends on where the sheet is in the frame itself (`FrameContext.past`): predicted until it stays."""
     hanging: bool = False
     """Whether only a sheet with weight and no bed under it may have it."""
     sensing: bool = False
@@ -52,9 +52,10 @@ class Effect:
                 f"Effect {self.name}: units and prior_sd need one entry for each parameter; got {len(self.units)} and "
                 f"{len(self.prior_sd)}."
             )
-        if any(len(one) != len(self.prior_sd) for one in self.natural):
+        if any(len(one) != len(self.prior_sd) for one in self.initial_guesses):
             raise ValueError(
-                f"Effect {self.name}: each start in natural needs {len(self.prior_sd)} parameters; got {self.natural}."
+                f"Effect {self.name}: each of initial_guesses needs {len(self.prior_sd)} parameters; got "
+                f"{self.initial_guesses}."
             )
         if not all(sd > 0 for sd in self.prior_sd):
             raise ValueError(f"Effect {self.name}: prior_sd must be above 0; got {self.prior_sd}.")

@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..physics.bending import IsometricBending
-from ..physics.environment import Bed, Weight
+from ..physics.environment import BedContact, Weight
 from ..physics.hanging import Tension
 from ..physics.membrane import TriangleMembrane, plane_stress
 from .effect import Effect
-from .sheet_model import Moment, SheetModel, across, extent
-from .terms import Film, Load
+from .sheet_model import FrameContext, SheetModel, across, extent
+from .terms import AdhesionFilm, DeadLoad
 
 STANDARD_GRAVITY = 9.80665
 """[m/s^2]."""
@@ -42,7 +42,7 @@ def cosines(place: Float[Array, "m 2"], waves: int) -> Float[Array, "m modes"]:
     return (wave[:, :, None, 0] * wave[:, None, :, 1]).reshape(len(place), waves**2)
 
 
-def _gravity(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
+def _gravity(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
     weight = model.term(Weight)
     gravity = weight.gravity + STANDARD_GRAVITY * theta
     changed = model.with_term(eqx.tree_at(lambda t: t.gravity, weight, gravity))
@@ -52,40 +52,40 @@ def _gravity(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> Sh
     return changed.with_term(eqx.tree_at(lambda t: t.stress, tension, share * tension.stress))
 
 
-def _bed(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
-    if not model.has(Bed):  # a sheet in the air
+def _bed(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
+    if not model.has(BedContact):  # a sheet in the air
         return model
-    bed, level = model.term(Bed), moment.rest - jnp.mean(moment.rest, axis=0)[None]
+    bed, level = model.term(BedContact), moment.rest - jnp.mean(moment.rest, axis=0)[None]
     raised = theta[0] + level[:, 0] * theta[1] + level[:, 1] * theta[2]
     return model.with_term(eqx.tree_at(lambda t: t.height, bed, bed.height + raised))
 
 
-def _stretch(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+def _stretch(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
     return _stiffer(model, jnp.exp(theta[0]))
 
 
-def _poisson(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+def _poisson(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
     """By how much the sheet narrows as it is stretched; Young's modulus stays."""
     membrane = model.term(TriangleMembrane)
     change = membrane.stiffness * (plane_stress(membrane.poisson + theta[0]) - plane_stress(membrane.poisson))
     return _with_elasticity(model, membrane.elasticity + change[None])
 
 
-def _bending(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+def _bending(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
     bending, root = model.term(IsometricBending), jnp.exp(theta[0] / 2)
     changed = eqx.tree_at(lambda t: (t.weight, t.curvature), bending, (root * bending.weight, root * bending.curvature))
     return model.with_term(changed)
 
 
-def _heterogeneity(model: SheetModel, theta: Float[Array, " modes"], moment: Moment) -> SheetModel:
+def _heterogeneity(model: SheetModel, theta: Float[Array, " modes"], moment: FrameContext) -> SheetModel:
     return _stiffer(model, jnp.exp(cosines(_places(model, moment), MODES) @ theta)[:, None, None])
 
 
-def _inclusion(model: SheetModel, theta: Float[Array, " spots"], moment: Moment) -> SheetModel:
+def _inclusion(model: SheetModel, theta: Float[Array, " spots"], moment: FrameContext) -> SheetModel:
     return _stiffer(model, jnp.exp(spots(_places(model, moment)) @ theta)[:, None, None])
 
 
-def _anisotropy(model: SheetModel, theta: Float[Array, " angles"], moment: Moment) -> SheetModel:
+def _anisotropy(model: SheetModel, theta: Float[Array, " angles"], moment: FrameContext) -> SheetModel:
     """Fibres along n of strength a store a k (n.E n)^2 / 2 an area."""
     membrane, angle = model.term(TriangleMembrane), jnp.asarray(np.pi * np.arange(ANGLES) / ANGLES)
     along = jnp.stack([jnp.cos(angle) ** 2, jnp.sin(angle) ** 2, jnp.cos(angle) * jnp.sin(angle)], axis=1)
@@ -93,32 +93,32 @@ def _anisotropy(model: SheetModel, theta: Float[Array, " angles"], moment: Momen
     return _with_elasticity(model, membrane.elasticity + fibres[None])
 
 
-def _pre_strain(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
+def _pre_strain(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
     """Where it lay the sheet was longer by theta than it would be by itself."""
     membrane = model.term(TriangleMembrane)
     longer = jnp.stack([theta[0], theta[1], 2 * theta[2]])
     return model.with_term(eqx.tree_at(lambda t: t.inelastic, membrane, membrane.inelastic - longer[None]))
 
 
-def _strain_stiffening(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+def _strain_stiffening(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
     membrane = model.term(TriangleMembrane)
     return model.with_term(eqx.tree_at(lambda t: t.stiffening, membrane, membrane.stiffening + theta[0]))
 
 
-def _anchor_shift(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
+def _anchor_shift(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
     return eqx.tree_at(lambda one: one.energy.rest, model, model.energy.rest + theta[None])
 
 
-def _point_pull(model: SheetModel, theta: Float[Array, " pulls"], moment: Moment) -> SheetModel:
+def _point_pull(model: SheetModel, theta: Float[Array, " pulls"], moment: FrameContext) -> SheetModel:
     """One force a spot, spread over its particles."""
     share = spots(flat(model.term(TriangleMembrane), moment.rest, moment.rest))
     share = share / jnp.maximum(jnp.sum(share, axis=0), 1.0)[None]
-    load = model.term(Load)
+    load = model.term(DeadLoad)
     return model.with_term(eqx.tree_at(lambda t: t.force, load, load.force + share @ theta.reshape(GRID**2, 3)))
 
 
-def _adhesion(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
-    film, membrane = model.term(Film), model.term(TriangleMembrane)
+def _adhesion(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
+    film, membrane = model.term(AdhesionFilm), model.term(TriangleMembrane)
     area = jnp.zeros(len(moment.rest)).at[membrane.vertices].add(membrane.area[:, None] / 3)
     return model.with_term(eqx.tree_at(lambda t: t.work, film, film.work + theta[0] * area))
 
@@ -131,7 +131,7 @@ def _with_elasticity(model: SheetModel, elasticity: Float[Array, "f 3 3"]) -> Sh
     return model.with_term(eqx.tree_at(lambda t: t.elasticity, model.term(TriangleMembrane), elasticity))
 
 
-def _places(model: SheetModel, moment: Moment) -> Float[Array, "f 2"]:
+def _places(model: SheetModel, moment: FrameContext) -> Float[Array, "f 2"]:
     """Of the triangles' middles."""
     membrane = model.term(TriangleMembrane)
     return flat(membrane, moment.rest, jnp.mean(moment.rest[membrane.vertices], axis=1))

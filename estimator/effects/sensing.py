@@ -6,8 +6,8 @@ from jaxtyping import Array, Float
 
 from ..physics.membrane import TriangleMembrane
 from .effect import Effect
-from .sheet_model import Moment, SheetModel, across, extent
-from .surface_points import Followed
+from .sheet_model import FrameContext, SheetModel, across, extent
+from .surface_points import SurfacePoints
 
 SMALL_ANGLE = 1e-3
 """[rad]."""
@@ -17,69 +17,71 @@ EDGE = 1e-6
 """How far what slides may go beyond the edge, so that at rest it may go either way [m]."""
 
 
-def _tool_bias(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
+def _tool_bias(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
     """What is held lies elsewhere than the tool's way since the jaws closed says: they slid, or the report jumped."""
     return _taken(model, model.tool + jnp.where(moment.closed > 0, theta, 0.0))
 
 
-def _tool_scale(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+def _tool_scale(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
     """The true way is exp(theta) times the reported one."""
     return _taken(model, jnp.exp(theta[0]) * model.tool)
 
 
-def _tool_latency(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+def _tool_latency(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
     """What is reported now is where the tool was theta ago."""
     return _at_another_time(model, moment, theta[0])
 
 
-def _image_latency(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+def _image_latency(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
     """What is seen now is the sheet as the tool held it theta ago."""
     return _at_another_time(model, moment, -theta[0])
 
 
-def _tool_turn(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
+def _tool_turn(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
     """The true way is the reported one turned by theta [rad], late as either may be."""
     return _taken(model, _rotation(theta) @ model.tool)
 
 
-def _camera_bias(model: SheetModel, theta: Float[Array, " 6"], moment: Moment) -> SheetModel:
+def _camera_bias(model: SheetModel, theta: Float[Array, " 6"], moment: FrameContext) -> SheetModel:
     """Shift [m] and turn [rad] of all that is seen, about the middle of the sheet, since it was seen at rest."""
     return _moved(model, theta[:3], theta[3:])
 
 
-def _camera_drift(model: SheetModel, theta: Float[Array, " 7"], moment: Moment) -> SheetModel:
+def _camera_drift(model: SheetModel, theta: Float[Array, " 7"], moment: FrameContext) -> SheetModel:
     """The same, growing with time from when it began."""
     lasted = _since(theta[6], moment)
     return _moved(model, lasted * theta[:3], lasted * theta[3:6])
 
 
-def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], moment: Moment) -> SheetModel:
+def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], moment: FrameContext) -> SheetModel:
     """All is seen larger by a factor about the camera, and that is somewhere beside the middle of the sheet."""
     factor = jnp.exp(theta[0])
     larger = eqx.tree_at(lambda one: one.view.turn, model, factor * model.view.turn)
     return eqx.tree_at(lambda one: one.view.shift, larger, larger.view.shift + (1 - factor) * theta[1:])
 
 
-def _point_slip(model: SheetModel, theta: Float[Array, " 3"], moment: Moment) -> SheetModel:
+def _point_slip(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
     """What is followed slides over the sheet since it began to, at most to the edge of the rectangle around it."""
     membrane = model.term(TriangleMembrane)
     place = across(membrane, moment.rest, moment.rest)
     low, high = extent(place)
     to = jnp.clip(place + _since(theta[2], moment) * theta[None, :2], low - EDGE, high + EDGE)
-    return eqx.tree_at(lambda one: one.view.followed, model, Followed.at(jnp.asarray(membrane.vertices), place, to))
+    return eqx.tree_at(
+        lambda one: one.view.followed, model, SurfacePoints.at(jnp.asarray(membrane.vertices), place, to)
+    )
 
 
-def _surface_height(model: SheetModel, theta: Float[Array, " 1"], moment: Moment) -> SheetModel:
+def _surface_height(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
     """The surface that is seen lies theta above the middle of the sheet."""
     return eqx.tree_at(lambda one: one.view.height, model, model.view.height + theta[0])
 
 
-def _since(began: Float[Array, ""], moment: Moment) -> Float[Array, ""]:
+def _since(began: Float[Array, ""], moment: FrameContext) -> Float[Array, ""]:
     """How long it has lasted [s]."""
     return jnp.maximum(moment.time - began, 0.0)
 
 
-def _at_another_time(model: SheetModel, moment: Moment, later: Float[Array, ""]) -> SheetModel:
+def _at_another_time(model: SheetModel, moment: FrameContext, later: Float[Array, ""]) -> SheetModel:
     """With the tool where its reports have it so much later; where the jaws close, what they hold has gone nowhere."""
 
     def at(time: Array) -> Array:
@@ -185,7 +187,7 @@ SENSING = (
         acts=_depth_scale,
         units=("log factor", "m", "m", "m"),
         prior_sd=(0.03, 0.15, 0.15, 0.15),
-        natural=((0.03, 0.0, 0.0, 0.15), (-0.03, 0.0, 0.0, 0.15)),
+        initial_guesses=((0.03, 0.0, 0.0, 0.15), (-0.03, 0.0, 0.0, 0.15)),
         source="a baseline that is wrong by 1 to 3 %, at a distance of 0.1 to 0.2 m",
         confounded_with=("camera_bias", "tool_scale", "pre_strain"),
         sensing=True,

@@ -18,8 +18,8 @@ from ..physics.environment import Tether, Weight
 from ..physics.membrane import TriangleMembrane
 from ..physics.mesh import SheetMesh
 from ..physics.surrogate import surrogate
-from .surface_points import Followed
-from .terms import Film, Load, Rub
+from .surface_points import SurfacePoints
+from .terms import AdhesionFilm, DeadLoad, FrictionElements
 
 Kind = TypeVar("Kind", bound=Term)
 
@@ -41,7 +41,7 @@ class View(eqx.Module):
     turn: Float[Array, "3 3"]
     shift: Float[Array, " 3"]
     """[m]."""
-    followed: Followed
+    followed: SurfacePoints
     height: Float[Array, ""]
     """Of the surface over the middle [m]."""
     lying: Float[Array, "n 3"]
@@ -81,7 +81,7 @@ class SheetModel(eqx.Module):
         return eqx.tree_at(lambda model: model.energy.terms, self, terms)
 
 
-class Moment(eqx.Module):
+class FrameContext(eqx.Module):
     """What an effect may know of a frame."""
 
     rest: Float[Array, "n 3"]
@@ -134,7 +134,7 @@ class Moment(eqx.Module):
         return self.ended, jnp.where(self.ended <= self.time, self.began, jnp.inf)
 
 
-def undisturbed(mesh: SheetMesh, declaration: Declaration) -> SheetEnergy:
+def nominal_energy(mesh: SheetMesh, declaration: Declaration) -> SheetEnergy:
     """The declared sheet's energy with all the terms that effects may need.
 
     Raises:
@@ -144,7 +144,7 @@ def undisturbed(mesh: SheetMesh, declaration: Declaration) -> SheetEnergy:
     terms: tuple[Term, ...] = energy.terms
     if not any(isinstance(term, Weight) for term in terms):
         terms = (*terms, Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=(0, 0, 0)))
-    terms = (*terms, *(kind.build(mesh.rest) for kind in (Rub, Load, Film, Tether)))
+    terms = (*terms, *(kind.build(mesh.rest) for kind in (FrictionElements, DeadLoad, AdhesionFilm, Tether)))
     return SheetEnergy.build(mesh.rest, terms, Layout.from_pattern(mesh.adjacency, mesh.rest))
 
 
@@ -174,7 +174,7 @@ def centred(mesh: SheetMesh) -> View:
         centre=jnp.asarray(mesh.rest.mean(axis=0)),
         turn=jnp.eye(3),
         shift=jnp.zeros(3),
-        followed=Followed.themselves(mesh.n),
+        followed=SurfacePoints.themselves(mesh.n),
         height=jnp.zeros(()),
         lying=_normals(tangents(membrane, jnp.asarray(mesh.rest))),
     )

@@ -13,7 +13,7 @@ BEYOND = 1e-3
 """How far beyond a side a point may be, by the triangle's height: from the outline particles may go either way."""
 
 
-class Followed(eqx.Module):
+class SurfacePoints(eqx.Module):
     """A point of the sheet for each particle, in one of its triangles.
 
     Between the corners of a triangle the sheet is a cubic Bezier patch with its derivatives there [PN triangles:
@@ -27,7 +27,7 @@ class Followed(eqx.Module):
     """From each corner to each, in the sheet [m]."""
 
     @classmethod
-    def themselves(cls, n: int) -> "Followed":
+    def themselves(cls, n: int) -> "SurfacePoints":
         """The particles."""
         return cls(
             corners=jnp.broadcast_to(jnp.arange(n)[:, None], (n, 3)),
@@ -36,7 +36,7 @@ class Followed(eqx.Module):
         )
 
     @classmethod
-    def at(cls, triangles: Int[Array, "f 3"], place: Float[Array, "n 2"], to: Float[Array, "n 2"]) -> "Followed":
+    def at(cls, triangles: Int[Array, "f 3"], place: Float[Array, "n 2"], to: Float[Array, "n 2"]) -> "SurfacePoints":
         """Material at places [m], where particles are at `place`; what is beyond the outline stops near it."""
         slope, first = _slopes(place[triangles]), jnp.eye(3)[:1]
 

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from ..physics.environment import Weight
 from .effect import Effect
-from .sheet_model import Moment, SheetModel
-from .terms import Load
+from .sheet_model import FrameContext, SheetModel
+from .terms import DeadLoad
 
 BESSEL = 2.404825557695773
 """First zero of J0."""
@@ -29,9 +29,9 @@ SHORTEST, WEAKEST = 1e-3, 1e-9
 """Length of a sheet that hangs, and gravity that it hangs by, at least [m, m/s^2]."""
 
 
-def _swing(model: SheetModel, theta: Float[Array, " 2"], moment: Moment) -> SheetModel:
+def _swing(model: SheetModel, theta: Float[Array, " 2"], moment: FrameContext) -> SheetModel:
     """theta: the share of the mass that the frames show, air that goes with it included, and the damping rate c."""
-    weight, load = model.term(Weight), model.term(Load)
+    weight, load = model.term(Weight), model.term(DeadLoad)
     g = jnp.sqrt(jnp.sum(weight.gravity**2) + WEAKEST**2)
     down = weight.gravity / g
     square = (BESSEL / 2) ** 2 * g / jnp.maximum(jnp.ptp(moment.rest @ down), SHORTEST)
@@ -41,7 +41,7 @@ def _swing(model: SheetModel, theta: Float[Array, " 2"], moment: Moment) -> Shee
     return model.with_term(eqx.tree_at(lambda t: t.force, load, load.force + weight.mass[:, None] * pull[None]))
 
 
-def _kicks(moment: Moment) -> Float[Array, "reports 3"]:
+def _kicks(moment: FrameContext) -> Float[Array, "reports 3"]:
     """By how much the grip's velocity changes at each report; it stood before the first and after the last [m/s]."""
     lasted, gone = jnp.diff(moment.report_times), jnp.diff(moment.reports, axis=0)
     speed = jnp.where(lasted[:, None] > 0, gone / jnp.where(lasted > 0, lasted, 1.0)[:, None], 0.0)
@@ -66,7 +66,7 @@ SWING = (
         acts=_swing,
         units=("", "1/s"),
         prior_sd=(1.0, 5.0),
-        natural=((1.0, 1.0), (2.0, 1.0)),  # of itself, and with as much air
+        initial_guesses=((1.0, 1.0), (2.0, 1.0)),  # of itself, and with as much air
         source="the sheet's own mass; a cloth in air swings for a second",
         confounded_with=("inertia", "image_latency", "viscous_drag"),
         non_negative=True,

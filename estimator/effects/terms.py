@@ -20,7 +20,7 @@ REACH = 2e-3
 """Distance at which a film has given most of its energy [m]."""
 
 
-class Rub(Term):
+class FrictionElements(Term):
     """Friction on the bed."""
 
     vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
@@ -31,7 +31,7 @@ class Rub(Term):
     up: Float[Array, " 3"]
 
     @classmethod
-    def build(cls, rest: Float[np.ndarray, "n 3"]) -> "Rub":
+    def build(cls, rest: Float[np.ndarray, "n 3"]) -> "FrictionElements":
         """Without friction."""
         return cls(
             vertices=np.arange(len(rest))[:, None],
@@ -67,7 +67,7 @@ class Rub(Term):
         return way, jnp.sqrt(jnp.sum(way**2, axis=1) + STICK**2)
 
 
-class Load(Term):
+class DeadLoad(Term):
     """A force that stays as it is."""
 
     vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
@@ -75,7 +75,7 @@ class Load(Term):
     """[N]."""
 
     @classmethod
-    def build(cls, rest: Float[np.ndarray, "n 3"]) -> "Load":
+    def build(cls, rest: Float[np.ndarray, "n 3"]) -> "DeadLoad":
         """None."""
         return cls(vertices=np.arange(len(rest))[:, None], force=jnp.zeros(rest.shape))
 
@@ -96,7 +96,7 @@ class Load(Term):
         return self.hessian(x)
 
 
-class Film(Term):
+class AdhesionFilm(Term):
     """What holds a particle near where it lay until it is peeled off: w (1 - exp(-|x - a|^2 / r^2))."""
 
     vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
@@ -106,7 +106,7 @@ class Film(Term):
     """w, of peeling a particle off [J]."""
 
     @classmethod
-    def build(cls, rest: Float[np.ndarray, "n 3"]) -> "Film":
+    def build(cls, rest: Float[np.ndarray, "n 3"]) -> "AdhesionFilm":
         """A dry sheet."""
         return cls(vertices=np.arange(len(rest))[:, None], rest=jnp.asarray(rest), work=jnp.zeros(len(rest)))
 

@@ -18,8 +18,8 @@ from jiggle_mj.observation import Declaration
 from ..belief.boundary_belief import BoundaryBelief
 from ..physics.mesh import SheetMesh
 from ..physics.xpbd import XPBD
-from .evidence import Evidence, Filter, Update, not_stated
-from .shots import SWEEPS, History, Shots, predicted, simulator
+from .evidence import Evidence, Filter, Update, unavailable
+from .shots import SWEEPS, ShotHistory, Shots, predicted, simulator
 
 RATE = 1e-3
 """Adam's learning rate, which is about how far b moves in a step [membrane stiffness]."""
@@ -33,7 +33,7 @@ class AdamShooting(Filter):
     def __init__(self, mesh: SheetMesh, declaration: Declaration, *, grip_stiffness: float, samples: int) -> None:
         """Build the simulator; see `MultipleShooting`."""
         self._simulator = simulator(mesh, declaration)
-        self._history = History(grip_stiffness=grip_stiffness, samples=samples)
+        self._history = ShotHistory(grip_stiffness=grip_stiffness, samples=samples)
         self._rate = RATE * declaration.membrane_stiffness
         self._moments = optax.adam(self._rate).init(jnp.zeros(mesh.n))
 
@@ -50,7 +50,7 @@ class AdamShooting(Filter):
             self._moments = moments
         else:
             self._history.reject()
-        none = not_stated(b)
+        none = unavailable(b)
         return Update(
             belief=BoundaryBelief(precision=jnp.broadcast_to(none, (len(b), len(b))), shift=none),
             x=evidence.y,

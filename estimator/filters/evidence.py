@@ -32,7 +32,7 @@ class Evidence(eqx.Module):
     """R^-1, zero where a particle is missing [1/m^2]."""
     held: Bool[Array, " n"]
     """Particles in the grip, which follow the tip."""
-    loaded: Bool[Array, " n"]
+    force_unknown: Bool[Array, " n"]
     """Particles that the grip may pull at, the held ones among them, whose balance of forces is unknown."""
     pull: Pull | None = None
 
@@ -47,7 +47,7 @@ class Evidence(eqx.Module):
         return jnp.trace(self.precision, axis1=1, axis2=2) > 0
 
 
-class Stated(eqx.Module):
+class PosteriorSummary(eqx.Module):
     """What a filter believes; what it does not state (uncertainty, or P(attached)) is NaN."""
 
     belief: BoundaryBelief | AttachmentBelief
@@ -65,7 +65,7 @@ class Stated(eqx.Module):
     halves of the samples agree. True where nothing is searched or sampled."""
 
 
-class Update(Stated):
+class Update(PosteriorSummary):
     """The outcome of one frame."""
 
     x: Float[Array, "n 3"]
@@ -96,15 +96,15 @@ class Filter(ABC):
     def forget(self) -> None:  # noqa: B027  # most keep nothing
         """Something was cut or sewn: take nothing again that was seen before."""
 
-    def reconsider(self, belief: Any) -> Stated | None:
+    def reconsider(self, belief: Any) -> PosteriorSummary | None:
         """A second look at a belief between two frames, for whoever acts on it; None where there is none."""
         return None
 
-    def release(self, belief: Any, *, thorough: bool = True) -> Stated | None:
+    def release(self, belief: Any, *, thorough: bool = True) -> PosteriorSummary | None:
         """Say that the jaws have opened; None where that changes nothing. In passing if more grasps are to come."""
         return None
 
 
-def not_stated(like: Float[Array, " n"]) -> Float[Array, " n"]:
+def unavailable(like: Float[Array, " n"]) -> Float[Array, " n"]:
     """NaN for every particle."""
     return jnp.full_like(like, jnp.nan)

@@ -30,8 +30,8 @@ from jiggle_mj.observation import Declaration
 from ..belief.boundary_belief import BoundaryBelief, entropy, standard_deviations
 from ..physics.mesh import SheetMesh
 from ..physics.xpbd import XPBD
-from .evidence import Evidence, Filter, Update, not_stated
-from .shots import SWEEPS, History, Shots, predicted, simulator, slopes
+from .evidence import Evidence, Filter, Update, unavailable
+from .shots import SWEEPS, ShotHistory, Shots, predicted, simulator, slopes
 
 PRIOR_MEAN = 1e-4
 """The paper's mu_0 [N/m]."""
@@ -50,7 +50,7 @@ class MultipleShooting(Filter):
             samples: k.
         """
         self._simulator = simulator(mesh, declaration)
-        self._history = History(grip_stiffness=grip_stiffness, samples=samples)
+        self._history = ShotHistory(grip_stiffness=grip_stiffness, samples=samples)
 
     def forget(self) -> None:
         """After a cut or suture: draw no step from before it."""
@@ -64,13 +64,13 @@ class MultipleShooting(Filter):
         b = non_negative(belief, b)
         if not (np.isfinite(factor).all() and np.isfinite(nis)):
             self._history.reject()
-            b = not_stated(b)
+            b = unavailable(b)
         return Update(
             belief=belief,
             x=evidence.y,
             b=b,
             sd=standard_deviations(factor),
-            probability=not_stated(b),
+            probability=unavailable(b),
             entropy=entropy(factor),
             nis=nis,
             converged=jnp.asarray(True),

@@ -34,7 +34,7 @@ from ..physics.block_tridiagonal import (
 from ..physics.energy import SheetEnergy
 from ..physics.mesh import SheetMesh, neighbour_table, pattern, places_back
 from .evidence import Evidence
-from .noise import Misfit
+from .noise import ForceResiduals
 from .tethered import Tethered
 
 ROUGH = 3.0
@@ -202,12 +202,14 @@ class ForceBalance(eqx.Module):
             covariance=inverse_band(frame.factor),
         )
 
-    def information(self, frame: "Frame", fit: "Fit") -> "Information":
+    def information(self, frame: "Frame", fit: "Fit") -> "FrameInformation":
         """What the frame says of s, with its state eliminated."""
         slope, whitened = self.calibrated(frame, fit), frame.weight[:, None] * fit.left
         pulled = -jnp.sum(slope * whitened, axis=1)
         squared = jnp.sum(fit.residual * whitened)
-        return Information(precision=self.precision_along(frame, slope), pulled=pulled, squared=squared, at=frame.s)
+        return FrameInformation(
+            precision=self.precision_along(frame, slope), pulled=pulled, squared=squared, at=frame.s
+        )
 
     def precision_along(self, frame: "Frame", slope: Float[Array, "n 3"]) -> Float[Array, "n n"]:
         """D^T N^-1 D for a D with a column for each particle, which is `slope` there."""
@@ -224,14 +226,14 @@ class ForceBalance(eqx.Module):
         pushed = self._transposed(frame.rows, frame.weight[:, None] * v)
         return frame.weight[:, None] * (v - self.apply(frame.rows, solve(self.layout, frame.factor, pushed)))
 
-    def misfit(self, frame: "Frame", fit: "Fit", evidence: Evidence) -> Misfit:
+    def misfit(self, frame: "Frame", fit: "Fit", evidence: Evidence) -> ForceResiduals:
         """What is left of the frame."""
         w, free = frame.weight, evidence.seen & ~evidence.held
         fitted = w * window_sums(self.layout, fit.covariance, self.places, frame.rows)
         root = jnp.linalg.cholesky(jnp.where(free[:, None, None], evidence.precision, jnp.eye(3)))
         root = jnp.where(free[:, None, None], jnp.swapaxes(root, 1, 2), 0.0)
         seen = window_sums(self.layout, fit.covariance, self.own_place, root[:, None])
-        return Misfit(
+        return ForceResiduals(
             force=jnp.sqrt(w)[:, None] * fit.left,
             force_degrees=jnp.sum(jnp.where(w > 0, 3 - fitted, 0.0)),
             position=jnp.einsum("nij,nj->ni", root, fit.off),
@@ -252,7 +254,7 @@ class ForceBalance(eqx.Module):
 
     def _weight(self, error: Float[Array, " n"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, " n"]:
         variance = ((1 - s) * error) ** 2 + (s * self.reference * self.anchor_sd) ** 2
-        return jnp.where(evidence.loaded, 0.0, 1 / variance)
+        return jnp.where(evidence.force_unknown, 0.0, 1 / variance)
 
     def unbalanced(self, x: Float[Array, "n 3"], s: Float[Array, " n"]) -> Float[Array, "n 3"]:
         """R [N]."""
@@ -340,7 +342,7 @@ class Fit(eqx.Module):
     """The blocks of A^-1 where A has blocks [m^2]."""
 
 
-class Information(eqx.Module):
+class FrameInformation(eqx.Module):
     """What a frame says of s."""
 
     precision: Float[Array, "n n"]

@@ -18,17 +18,17 @@ from jaxtyping import Array, Bool, Float, Int
 from ..belief.attachment_belief import AttachmentBelief
 from ..belief.attachment_prior import AttachmentPrior
 from ..belief.spike_and_slab import SpikeAndSlab
-from ..parallel_map import side_by_side
+from ..parallel_map import parallel_map
 from ..physics.energy import SheetEnergy
 from ..physics.mesh import SheetMesh
-from .evidence import Evidence, Filter, Stated, Update
-from .force_balance import Fit, ForceBalance, Frame, Information
-from .noise import Misfit, Noise
+from .evidence import Evidence, Filter, PosteriorSummary, Update
+from .force_balance import Fit, ForceBalance, Frame, FrameInformation
+from .noise import ForceResiduals, Noise
 
 SPIKE = 3e-4
 """Width of s where free."""
-RUNGS, SPREAD, EVEN = tuple(0.003 * 10 ** (i / 4) for i in range(11)), 0.3, 3.0
-"""Of s where attached, from hardly felt to rigid; their relative widths; see `SpikeAndSlab.even`."""
+COMPONENTS, SPREAD, DIRICHLET_STRENGTH = tuple(0.003 * 10 ** (i / 4) for i in range(11)), 0.3, 3.0
+"""Of s where attached, from hardly felt to rigid; their relative widths; see `SpikeAndSlab.dirichlet_strength`."""
 PARTIAL = 0.4
 """Share of attached particles that have a part of an attachment, as at a border: what two meshes make of the shipped
 scenes."""
@@ -80,11 +80,11 @@ class ImplicitFilter(Filter):
             self._between = False
         return update
 
-    def reconsider(self, belief: AttachmentBelief) -> Stated:
+    def reconsider(self, belief: AttachmentBelief) -> PosteriorSummary:
         """See `Filter.reconsider`: as few samples give it, which find most of what propagation misses in a grasp."""
         return reconsidered(belief)
 
-    def release(self, belief: AttachmentBelief, *, thorough: bool = True) -> Stated | None:
+    def release(self, belief: AttachmentBelief, *, thorough: bool = True) -> PosteriorSummary | None:
         """The belief with all grasps linearised again that need it; the next frame begins another grasp.
 
         In passing the noise is not judged, and few samples have to do.
@@ -92,9 +92,9 @@ class ImplicitFilter(Filter):
         if self._between and not (thorough and self._due):
             return None
         self._between, self._due = True, not thorough
-        return self._judged(belief) if thorough else self._settled(_sampled(belief, PASSING), STALE, 1)
+        return self._refined(belief) if thorough else self._settled(_sampled(belief, PASSING), STALE, 1)
 
-    def restart(self, belief: AttachmentBelief) -> Stated:
+    def restart(self, belief: AttachmentBelief) -> PosteriorSummary:
         """Keep a belief as it is: no frame from before is judged again. The next one begins another grasp."""
         self._between, self._grasps, self._kept = True, [], (belief.precision, belief.shift)
         return _swept(belief)
@@ -103,12 +103,12 @@ class ImplicitFilter(Filter):
         """What the frames since `restart`, or all frames, say of s, in information form; None before the first."""
         return self._total() if self._grasps else None
 
-    def of(self, belief: AttachmentBelief, energy: SheetEnergy) -> Stated:
+    def of(self, belief: AttachmentBelief, energy: SheetEnergy) -> PosteriorSummary:
         """All grasps so far judged again by another energy of the same sheet, the noise learned anew."""
         self._balance, self._noise = self._balance.of(energy), Noise()
         for grasp in self._grasps:
             grasp.noise = None
-        return self._judged(belief)
+        return self._refined(belief)
 
     @property
     def energy(self) -> SheetEnergy:
@@ -126,22 +126,22 @@ class ImplicitFilter(Filter):
             for evidence, x, _ in grasp.frames:
                 yield self.balance, evidence.widened(self._noise.position), x
 
-    def _judged(self, belief: AttachmentBelief) -> Stated:
-        stated = self._settled(_sampled(belief, PASSING), STALE, PASSES)
+    def _refined(self, belief: AttachmentBelief) -> PosteriorSummary:
+        summary = self._settled(_sampled(belief, PASSING), STALE, PASSES)
         for _ in range(PASSES):
             if self._learned() == self._noise:
                 break
-            stated = self._settled(stated, FELT, 1)
+            summary = self._settled(summary, FELT, 1)
             self._noise = self._learned()
-            stated = self._settled(stated, STALE, PASSES)
-        return _sampled(stated.belief, SAMPLES)
+            summary = self._settled(summary, STALE, PASSES)
+        return _sampled(summary.belief, SAMPLES)
 
-    def _settled(self, stated: Stated, far: float, passes: int) -> Stated:
+    def _settled(self, summary: PosteriorSummary, far: float, passes: int) -> PosteriorSummary:
         """After grasps that were linearised further than `far` from what is believed were linearised again."""
         for _ in range(passes):
-            belief = stated.belief
+            belief = summary.belief
             assert isinstance(belief, AttachmentBelief)
-            s = belief.bounded(stated.b)
+            s = belief.bounded(summary.b)
             stale = [grasp.noise != self._noise or grasp.distance(s) > far for grasp in self._grasps]
             if not any(stale):
                 break
@@ -151,8 +151,8 @@ class ImplicitFilter(Filter):
             ]
             total = tuple(kept + new for kept, new in zip(self._kept, self._total(), strict=True))
             belief = eqx.tree_at(lambda one: (one.precision, one.shift), belief, total)
-            stated = _sampled(belief, PASSING)
-        return stated
+            summary = _sampled(belief, PASSING)
+        return summary
 
     def _total(self) -> tuple[Any, Any]:
         """What all grasps say together."""
@@ -164,12 +164,14 @@ class ImplicitFilter(Filter):
 
 def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
     """The prior of a sheet, with b_ref = reference [N/m]."""
-    stiffness = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=EVEN, partial=PARTIAL)
+    stiffness = SpikeAndSlab.build(
+        spike=SPIKE, components=COMPONENTS, spread=SPREAD, dirichlet_strength=DIRICHLET_STRENGTH, partial=PARTIAL
+    )
     prior = AttachmentPrior.build(mesh.n, mesh.edges, stiffness=stiffness, probability=PROBABILITY, coupling=COUPLING)
     return AttachmentBelief.before(prior, reference=reference)
 
 
-def reconsidered(belief: AttachmentBelief) -> Stated:
+def reconsidered(belief: AttachmentBelief) -> PosteriorSummary:
     """The belief as a few samples give it."""
     return _sampled(belief, PASSING)
 
@@ -188,12 +190,12 @@ class _Grasp:
         self.noise = noise
         self.precision: Float[Array, "n n"] | float = 0.0
         self.shift: Float[Array, " n"] | float = 0.0
-        self.misfit: Misfit | None = None
+        self.misfit: ForceResiduals | None = None
         """What they leave unexplained, if they were linearised again."""
         self.frames: list[tuple[Evidence, Float[Array, "n 3"], Float[Array, " n"]]] = []
         """What was seen, the state, and the s of the linearisation."""
 
-    def take(self, evidence: Evidence, x: Float[Array, "n 3"], found: Information) -> None:
+    def take(self, evidence: Evidence, x: Float[Array, "n 3"], found: FrameInformation) -> None:
         self.frames.append((evidence, x, found.at))
         self.precision, self.shift = self.precision + found.precision, self.shift + found.shift
 
@@ -205,13 +207,13 @@ class _Grasp:
         """The same frames, linearised at s for a noise."""
         grasp, balance = _Grasp(noise), balance.widened(noise.force)
 
-        def one(k: int) -> tuple[Float[Array, "n 3"], Information, Misfit]:
+        def one(k: int) -> tuple[Float[Array, "n 3"], FrameInformation, ForceResiduals]:
             evidence, x, _ = self.frames[k]
             noisy = evidence.widened(noise.position)
             frame, fit, found = _seen(balance, x, s, noisy)
             return frame.x, found, _misfit(balance, frame, fit, noisy)
 
-        for k, (x, found, misfit) in side_by_side(one, range(len(self.frames))).items():
+        for k, (x, found, misfit) in parallel_map(one, range(len(self.frames))).items():
             grasp.take(self.frames[k][0], x, found)
             grasp.misfit = misfit if grasp.misfit is None else grasp.misfit + misfit
         return grasp
@@ -223,7 +225,7 @@ _settled, _misfit = eqx.filter_jit(ForceBalance.settle), eqx.filter_jit(ForceBal
 @eqx.filter_jit
 def _seen(
     balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
-) -> tuple[Frame, Fit, Information]:
+) -> tuple[Frame, Fit, FrameInformation]:
     """What a frame says, from a state nearby."""
     frame = balance.approach(x, s, evidence)
     fit = balance.fit(frame)
@@ -232,24 +234,24 @@ def _seen(
 
 @eqx.filter_jit
 def _believed(
-    balance: ForceBalance, belief: AttachmentBelief, frame: Frame, found: Information, evidence: Evidence
+    balance: ForceBalance, belief: AttachmentBelief, frame: Frame, found: FrameInformation, evidence: Evidence
 ) -> Update:
     """The belief with what a frame says, and the state by it."""
     belief = belief.add(found.precision, found.shift)
     gaussian = belief.gaussian()
     nis = _normalised_innovation(found, gaussian.factor, evidence)
     belief = belief.sweep(gaussian)
-    stated = _stated(belief, frame.converged)
-    x = balance.polish(frame, belief.bounded(stated.b), evidence)
-    return Update(**vars(stated), x=x, nis=nis)
+    summary = _summary(belief, frame.converged)
+    x = balance.polish(frame, belief.bounded(summary.b), evidence)
+    return Update(**vars(summary), x=x, nis=nis)
 
 
 @eqx.filter_jit
-def _swept(belief: AttachmentBelief) -> Stated:
-    return _stated(belief.swept(SWEEPS), jnp.asarray(True))
+def _swept(belief: AttachmentBelief) -> PosteriorSummary:
+    return _summary(belief.swept(SWEEPS), jnp.asarray(True))
 
 
-def _sampled(belief: Any, rounds: tuple[int, int]) -> Stated:
+def _sampled(belief: Any, rounds: tuple[int, int]) -> PosteriorSummary:
     """On a CPU where JAX has one: samples follow one another, and a GPU takes ten times as long."""
     with jax.default_device(_cpus()[0]):
         return _state_sampled(belief, *map(jnp.asarray, rounds))
@@ -263,13 +265,13 @@ def _cpus() -> list[Any]:
 
 
 @eqx.filter_jit
-def _state_sampled(belief: AttachmentBelief, rounds: Int[Array, ""], doublings: Int[Array, ""]) -> Stated:
-    return _stated(*belief.sampled(jax.random.key(0), burn_in=BURN_IN, rounds=rounds, doublings=doublings))
+def _state_sampled(belief: AttachmentBelief, rounds: Int[Array, ""], doublings: Int[Array, ""]) -> PosteriorSummary:
+    return _summary(*belief.sampled(jax.random.key(0), burn_in=BURN_IN, rounds=rounds, doublings=doublings))
 
 
-def _stated(belief: AttachmentBelief, converged: Bool[Array, ""]) -> Stated:
+def _summary(belief: AttachmentBelief, converged: Bool[Array, ""]) -> PosteriorSummary:
     posterior = belief.posterior()
-    return Stated(
+    return PosteriorSummary(
         belief=belief,
         converged=converged,
         b=posterior.stiffness,
@@ -279,7 +281,9 @@ def _stated(belief: AttachmentBelief, converged: Bool[Array, ""]) -> Stated:
     )
 
 
-def _normalised_innovation(found: Information, factor: Float[Array, "n n"], evidence: Evidence) -> Float[Array, ""]:
+def _normalised_innovation(
+    found: FrameInformation, factor: Float[Array, "n n"], evidence: Evidence
+) -> Float[Array, ""]:
     """e^T (N + D Sigma D^T)^-1 e per degree of freedom, with Sigma from before the frame and e at the s of then.
 
     By Woodbury's identity e^T N^-1 e - p^T (Sigma^-1 + D^T N^-1 D)^-1 p with p = D^T N^-1 e; `factor` is
@@ -287,5 +291,5 @@ def _normalised_innovation(found: Information, factor: Float[Array, "n n"], evid
     """
     explained = found.pulled @ cho_solve((factor, True), found.pulled)
     observed = 3 * jnp.sum(evidence.seen)
-    degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.loaded), 1)
+    degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.force_unknown), 1)
     return (found.squared - explained) / degrees.astype(explained.dtype)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ..belief.boundary_belief import BoundaryBelief, entropy, standard_deviations
 from ..physics.energy import SheetEnergy
-from .evidence import Evidence, Filter, Update, not_stated
+from .evidence import Evidence, Filter, Update, unavailable
 from .tethered import Tethered
 
 
@@ -41,7 +41,7 @@ class NonNegativeLeastSquares(eqx.Module, Filter):
         sd = self.force_sd
         smooth = self.tethered.settle(b, evidence, start, force_sd=sd, force_tolerance=sd / 4)
         x = smooth.x
-        weight = jnp.where(evidence.loaded, 0.0, sd**-2)
+        weight = jnp.where(evidence.force_unknown, 0.0, sd**-2)
         d, force = x - self.energy.rest, self.energy.gradient(x, jnp.zeros_like(b))
         gained, pulled = weight * jnp.sum(d**2, axis=1), -weight * jnp.sum(d * force, axis=1)
         mean = belief.mean()
@@ -56,7 +56,7 @@ class NonNegativeLeastSquares(eqx.Module, Filter):
             x=x,
             b=after.non_negative_mean(b > 0),
             sd=standard_deviations(factor),
-            probability=not_stated(b),
+            probability=unavailable(b),
             entropy=entropy(factor),
             nis=(jnp.sum(innovation) - explained) / degrees,
             converged=smooth.converged,

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-class Misfit(eqx.Module):
+class ForceResiduals(eqx.Module):
     """What is left of one frame, or of the frames of one grasp together; whitened by the noise assumed."""
 
     force: Float[Array, "n 3"]
@@ -30,9 +30,9 @@ class Misfit(eqx.Module):
     """Observed less fitted position, 0 where nothing was seen or the jaws hold."""
     position_degrees: Float[Array, ""]
 
-    def __add__(self, other: "Misfit") -> "Misfit":
+    def __add__(self, other: "ForceResiduals") -> "ForceResiduals":
         """Of both together."""
-        return Misfit(
+        return ForceResiduals(
             force=self.force + other.force,
             force_degrees=self.force_degrees + other.force_degrees,
             position=self.position + other.position,
@@ -47,7 +47,7 @@ class Noise:
     force: float = 1.0
     position: float = 1.0
 
-    def learned(self, grasps: Sequence[Misfit]) -> "Noise":
+    def learned(self, grasps: Sequence[ForceResiduals]) -> "Noise":
         """After what this noise left of each grasp; the same object where that is about what it expected."""
         force = _excess([(one.force, one.force_degrees) for one in grasps])
         position = _excess([(one.position, one.position_degrees) for one in grasps])

@@ -45,7 +45,7 @@ class Shots(eqx.Module):
     """Inverse covariance of `end`, zero where nothing was observed [1/m^2]."""
 
 
-class History:
+class ShotHistory:
     """The samples since t_c; remembers, so that it belongs to one filter."""
 
     def __init__(self, *, grip_stiffness: float, samples: int) -> None:

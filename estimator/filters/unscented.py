@@ -27,7 +27,7 @@ from ..physics.energy import SheetEnergy
 from ..physics.environment import Grip
 from ..physics.equilibrium import equilibrium
 from ..physics.mesh import SheetMesh
-from .evidence import Evidence, Filter, Update, not_stated
+from .evidence import Evidence, Filter, Update, unavailable
 
 PATCHES = 40
 """r; on 10 cm x 10 cm a patch is 16 mm wide."""
@@ -84,7 +84,7 @@ class ReducedUnscented(Filter):
             x=x,
             b=theta[patch],
             sd=jnp.sqrt(variance[patch]),
-            probability=not_stated(b),
+            probability=unavailable(b),
             entropy=entropy(jnp.linalg.cholesky(marginals.precision)),
             nis=nis,
             converged=converged,

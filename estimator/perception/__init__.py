@@ -6,7 +6,7 @@ Of images: tissue mask, disparity, the estimator's own mesh, and tracks of its p
 """
 
 from .disparity import Disparity, SemiGlobalMatching
-from .perception import Believed, Sight
+from .perception import Believed, Perception
 from .point_tracker import PointTracker
 from .stereo_tracker import StereoTracker
 from .tissue_mask import TissueMask, WarmTissue
@@ -15,9 +15,9 @@ from .track import Track
 __all__ = [
     "Believed",
     "Disparity",
+    "Perception",
     "PointTracker",
     "SemiGlobalMatching",
-    "Sight",
     "StereoTracker",
     "TissueMask",
     "Track",

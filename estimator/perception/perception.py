@@ -25,7 +25,7 @@ Believed = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Grip]
 """What meets a cloud: the positions before, b, and the tip's move."""
 
 
-class Sight:
+class Perception:
     """Sees one sheet."""
 
     def __init__(

@@ -37,8 +37,8 @@ class Track:
 
     def __post_init__(self) -> None:
         """Check the covariances."""
-        turned = self.covariance.transpose(0, 2, 1)
-        symmetric = np.isclose(self.covariance, turned, rtol=1e-6, atol=0).all(axis=(1, 2))
+        rotated = self.covariance.transpose(0, 2, 1)
+        symmetric = np.isclose(self.covariance, rotated, rtol=1e-6, atol=0).all(axis=(1, 2))
         definite = np.linalg.eigvalsh(self.covariance)[:, 0] > 0
         if not (symmetric & definite).all():
             bad = int(np.argmin(symmetric & definite))

@@ -57,8 +57,8 @@ class IsometricBending(Term):
         length = jnp.linalg.norm(normal, axis=1, keepdims=True)
         normal = normal / length
         off = jnp.einsum("ha,hai->hi", self.weight, x) - self.curvature[:, None] * normal
-        turned = self.curvature[:, None] / length * (off - jnp.sum(off * normal, axis=1, keepdims=True) * normal)
-        of_edge, of_across = jnp.cross(across, turned), jnp.cross(turned, edge)
+        rotated = self.curvature[:, None] / length * (off - jnp.sum(off * normal, axis=1, keepdims=True) * normal)
+        of_edge, of_across = jnp.cross(across, rotated), jnp.cross(rotated, edge)
         first, second = self.facing[:, :1] * of_across, self.facing[:, 1:] * of_across
         direct = self.weight[:, :, None] * off[:, None, :]
         return direct - jnp.stack([second - first - of_edge, of_edge, first, -second], axis=1)

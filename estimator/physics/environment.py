@@ -49,7 +49,7 @@ class Weight(Term):
         return self.hessian(x)
 
 
-class Bed(Term):
+class BedContact(Term):
     """k/2 min(0, x . up - height)^2: the bed only pushes, and carries the sheet where it lay at rest.
 
     Taking the bed's height from the sheet itself keeps errors of the camera's height out of the contact.
@@ -71,7 +71,7 @@ class Bed(Term):
         load: Float[np.ndarray, " n"],
         up: Float[np.ndarray, " 3"],
         stiffness: float,
-    ) -> "Bed":
+    ) -> "BedContact":
         """A bed in which the sheet at rest lies so deep that it carries the load on each particle [N]."""
         return cls(
             vertices=np.arange(len(rest))[:, None],

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .bending import IsometricBending
 from .energy import SheetEnergy, Term
-from .environment import Bed, Weight
+from .environment import BedContact, Weight
 
 
 def ratios(energy: SheetEnergy) -> tuple[str, ...]:
@@ -28,7 +28,7 @@ def scaled(energy: SheetEnergy, log_factor: Float[Array, " k"]) -> SheetEnergy:
     def one(term: Term) -> Term:
         if isinstance(term, Weight):
             return eqx.tree_at(lambda t: t.mass, term, factor["weight"] * term.mass)
-        if isinstance(term, Bed):
+        if isinstance(term, BedContact):
             rest = energy.rest @ term.up
             return eqx.tree_at(lambda t: t.height, term, rest + factor["weight"] * (term.height - rest))
         if isinstance(term, IsometricBending):

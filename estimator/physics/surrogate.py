@@ -13,7 +13,7 @@ from jiggle_mj.observation import Declaration
 from .bending import IsometricBending
 from .block_tridiagonal import Layout
 from .energy import SheetEnergy, Term
-from .environment import Bed, Weight
+from .environment import BedContact, Weight
 from .hanging import Tension, as_it_hangs
 from .membrane import EdgeMembrane, TriangleMembrane
 from .mesh import SheetMesh
@@ -45,5 +45,5 @@ def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane =
         if declaration.bed:
             up = -gravity / np.linalg.norm(gravity)
             load = -np.asarray(weight.force) @ up
-            terms.append(Bed.build(mesh.rest, load=load, up=up, stiffness=BED_STIFFNESS * k))
+            terms.append(BedContact.build(mesh.rest, load=load, up=up, stiffness=BED_STIFFNESS * k))
     return SheetEnergy.build(mesh.rest, tuple(terms), Layout.from_pattern(mesh.adjacency, mesh.rest))

@@ -113,7 +113,9 @@ class XPBD(eqx.Module):
 
         def one(state, _):
             x, multipliers = state
-            return self._sweeps(self._carried(self._fall(x), x, multipliers, grip), multipliers, b, grip, sweeps), None
+            return self._sweeps(
+                self._transferred(self._fall(x), x, multipliers, grip), multipliers, b, grip, sweeps
+            ), None
 
         return jax.lax.scan(one, (x, self._slack(x)), length=steps)[0][0]
 
@@ -126,7 +128,7 @@ class XPBD(eqx.Module):
         of_mesh = tuple(jnp.zeros(len(batch.length), x.dtype) for batch in self.batches)
         return of_mesh, jnp.zeros(len(x), x.dtype), jnp.zeros_like(x)
 
-    def _carried(self, start, x, multipliers, grip):
+    def _transferred(self, start, x, multipliers, grip):
         """`start` moved by M^-1 grad C(x)^T lambda."""
         of_mesh, of_grip, of_boundary = multipliers
         w = self.inverse_mass[:, None]

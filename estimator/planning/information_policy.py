@@ -31,8 +31,8 @@ from ..estimator import Estimator
 from ..physics.mesh import SheetMesh, far_apart
 from .outcomes import outcomes
 from .policy import STEP, Policy, in_mm
-from .pull_predictor import Outcome, Outlook, Tug
-from .tool_kinematics import Tweezer
+from .pull_predictor import CandidatePull, Outcome, PullPredictor
+from .tool_kinematics import ToolKinematics
 from .workspace import Workspace
 
 AHEAD = (0.5, 1, 3)
@@ -73,7 +73,7 @@ PULLS = np.kron(DIRECTIONS, STEP * np.array(AHEAD)[:, None])
 """Where the tip may be pulled from where it is [m]: every direction as far as `AHEAD` says, one after the other."""
 
 
-class Information(Policy):
+class InformationPolicy(Policy):
     """Plans for one sheet."""
 
     def __init__(
@@ -82,7 +82,7 @@ class Information(Policy):
         *,
         radius: float,
         seed: int,
-        tweezer: Tweezer | None = None,
+        tweezer: ToolKinematics | None = None,
         regrasps: bool = True,
         enough: float = ENOUGH,
         about: Bool[np.ndarray, " n"] | None = None,
@@ -124,9 +124,9 @@ class Information(Policy):
         estimator.begin()
         with jax.enable_x64(True), one_thread():
             hold, tool = estimator.hold, estimator.tool
-            outlook = estimator.outlook(self._about)
+            predictor = estimator.predictor(self._about)
             if tool is None or not tool.closed:
-                return self._grasp(estimator, outlook) if self.regrasps else self._leaving or "nothing is grasped"
+                return self._grasp(estimator, predictor) if self.regrasps else self._leaving or "nothing is grasped"
             if hold is None:
                 return Release(), "no frame has shown what the jaws hold"
             if estimator.slip > LOST:
@@ -135,12 +135,12 @@ class Information(Policy):
             if self._leaving:
                 return Release(), self._leaving
             enough = self._enough * len(estimator.sheet.rest)
-            found = None if self._over else self._best_pull(estimator, outlook)
+            found = None if self._over else self._best_pull(estimator, predictor)
             if self._over:
                 self._leaving = self._over
             elif found is not None:
                 to, rate = found
-                elsewhere = self._best_place(estimator, outlook, above=rate) if self.regrasps else None
+                elsewhere = self._best_place(estimator, predictor, above=rate) if self.regrasps else None
                 if rate >= enough and elsewhere is None:
                     return Move(to=to), f"{rate:.0f} nat a step"
                 self._leaving = "another place teaches more" if elsewhere is not None else "little is left to learn"
@@ -154,16 +154,16 @@ class Information(Policy):
                 return Release(), self._leaving
             return Move(to=hold.tip), self._leaving
 
-    def _grasp(self, estimator: Estimator, outlook: Outlook) -> tuple[Action, str] | str:
+    def _grasp(self, estimator: Estimator, predictor: PullPredictor) -> tuple[Action, str] | str:
         self._leaving = ""
         if self._over:
             return self._over
-        probability = np.asarray(outlook.mixture.attached)
-        unsure = np.asarray(outlook.about) & (np.minimum(probability, 1 - probability) > DECIDED)
+        probability = np.asarray(predictor.mixture.attached)
+        unsure = np.asarray(predictor.about) & (np.minimum(probability, 1 - probability) > DECIDED)
         if not unsure.any():
             return f"enough is known: every P(attached) is below {DECIDED:g} or above {1 - DECIDED:g}"
         enough, self._worth = self._enough * len(unsure), dict.fromkeys(self._worth, np.inf)
-        place = self._best_place(estimator, outlook, above=enough)
+        place = self._best_place(estimator, predictor, above=enough)
         if not self._worth:
             return "no place of the sheet is within the tool's reach"
         if place is None:
@@ -171,23 +171,25 @@ class Information(Policy):
         self._place = place
         return Grasp(point=estimator.positions[place], radius=self._radius), f"{self._worth[place]:.0f} nat a step"
 
-    def _best_pull(self, estimator: Estimator, outlook: Outlook) -> tuple[Float[np.ndarray, " 3"], float] | None:
+    def _best_pull(
+        self, estimator: Estimator, predictor: PullPredictor
+    ) -> tuple[Float[np.ndarray, " 3"], float] | None:
         """Where the tip goes next, and what each step that way is expected to teach [nat]; None if nothing is safe."""
         hold, tool = estimator.hold, estimator.tool
         assert hold is not None and tool is not None
-        few, many = self._drawn(outlook)
+        few, many = self._drawn(predictor)
         start = estimator.positions
 
-        def tugs(tips: Float[np.ndarray, "k 3"]) -> Tug:
-            return self._tugs(estimator, hold.held, start, hold.closed_at + (tips - hold.tip)[:, None])
+        def candidates(tips: Float[np.ndarray, "k 3"]) -> CandidatePull:
+            return self._candidates(estimator, hold.held, start, hold.closed_at + (tips - hold.tip)[:, None])
 
-        more = underrated(outlook, tugs(tool.position[None]), many, least=TRIFLE * self._limits.energy)
+        more = underrated(predictor, candidates(tool.position[None]), many, least=TRIFLE * self._limits.energy)
 
         ends, ahead = tool.position + PULLS, np.tile(AHEAD, len(DIRECTIONS))
         reached = self._reached(estimator, ends)
 
         def rates(which: Int[np.ndarray, " k"], s: Float[Array, "_few n"]) -> Float[np.ndarray, " k"]:
-            gain = self._allowed_gain(outcomes(outlook, tugs(ends[which]), s), more=more).mean(axis=1)
+            gain = self._allowed_gain(outcomes(predictor, candidates(ends[which]), s), more=more).mean(axis=1)
             return np.where(reached[which], gain / np.maximum(ahead[which], 1), 0.0)
 
         first = rates(np.arange(len(ends)), few[:1])
@@ -197,19 +199,19 @@ class Information(Policy):
         best = [i for i in np.argsort(-rate)[:TRIED] if rate[i] > 0]
         for share, i in product(SHORTER, best):
             tip = tool.position + share * STEP * min(ahead[i], 1) * DIRECTIONS[i // len(AHEAD)]
-            if self._safe(outlook, tugs(tip[None]), many, more=more):
+            if self._safe(predictor, candidates(tip[None]), many, more=more):
                 return tip, float(rate[i])
         return None
 
-    def _best_place(self, estimator: Estimator, outlook: Outlook, *, above: float) -> int | None:
+    def _best_place(self, estimator: Estimator, predictor: PullPredictor, *, above: float) -> int | None:
         """The particle from which a lift teaches most for each step; None if that is not more than `above`."""
         rest = estimator.sheet.rest
         if not self._worth:
             self._edge = SheetMesh(rest, estimator.sheet.faces).border
             places = far_apart(rest, PLACES)
             self._worth = dict.fromkeys(places[self._reached(estimator, rest[places])].tolist(), np.inf)
-        probability = np.asarray(outlook.mixture.attached)
-        few, many = self._drawn(outlook)
+        probability = np.asarray(predictor.mixture.attached)
+        few, many = self._drawn(predictor)
         here = None if estimator.hold is None else estimator.hold.tip
         fresh: set[int] = set()
         while max(self._worth.values(), default=0.0) > above:
@@ -217,20 +219,20 @@ class Information(Policy):
             held = np.linalg.norm(rest - rest[best], axis=1) <= self._radius
             if best in fresh:
                 if self._safe(
-                    outlook, self._tugs(estimator, held, rest, rest[None] + STEP * DIRECTIONS[:1, None]), many
+                    predictor, self._candidates(estimator, held, rest, rest[None] + STEP * DIRECTIONS[:1, None]), many
                 ):
                     return best
                 self._worth[best] = 0.0
                 continue
             fresh.add(best)
             at_hand = here is not None and np.linalg.norm(rest[best] - here) < self._radius
-            suspect = probability[estimator.loaded(held)].max() > (SUSPECTED if self._edge[best] else KNOWN)
+            suspect = probability[estimator.force_unknown(held)].max() > (SUSPECTED if self._edge[best] else KNOWN)
             barred = at_hand or suspect or best in self._missed
-            self._worth[best] = 0.0 if barred else self._lifted(estimator, outlook, held, few)
+            self._worth[best] = 0.0 if barred else self._lifted(estimator, predictor, held, few)
         return None
 
     def _lifted(
-        self, estimator: Estimator, outlook: Outlook, held: Bool[np.ndarray, " n"], few: Float[Array, "_few n"]
+        self, estimator: Estimator, predictor: PullPredictor, held: Bool[np.ndarray, " n"], few: Float[Array, "_few n"]
     ) -> float:
         """What each step of a lift is expected to teach [nat], letting go and grasping counted.
 
@@ -238,7 +240,7 @@ class Information(Policy):
         """
         rest, heights = estimator.sheet.rest, STEP * np.array(LIFTS)
         found = outcomes(
-            outlook, self._tugs(estimator, held, rest, rest[None] + heights[:, None, None] * DIRECTIONS[0]), few
+            predictor, self._candidates(estimator, held, rest, rest[None] + heights[:, None, None] * DIRECTIONS[0]), few
         )
         best = np.maximum.accumulate(self._allowed_gain(found), axis=0)
         return float((best.mean(axis=1) / (REGRASP + np.array(LIFTS))).max())
@@ -247,53 +249,67 @@ class Information(Policy):
         assert estimator.tool is not None
         return Workspace.around(estimator, self._limits, self._tweezer).reached(tips, estimator.tool)
 
-    def _tugs(
+    def _candidates(
         self,
         estimator: Estimator,
         held: Bool[np.ndarray, " n"],
         start: Float[np.ndarray, "n 3"],
         to: Float[np.ndarray, "k n 3"],
-    ) -> Tug:
+    ) -> CandidatePull:
         """One grip taken to several places."""
-        parts = start, held, estimator.loaded(held)
-        start, held, loaded = (np.broadcast_to(part, (len(to), *part.shape)) for part in parts)
-        return Tug(start=jnp.asarray(start), held=jnp.asarray(held), loaded=jnp.asarray(loaded), to=jnp.asarray(to))
+        parts = start, held, estimator.force_unknown(held)
+        start, held, force_unknown = (np.broadcast_to(part, (len(to), *part.shape)) for part in parts)
+        return CandidatePull(
+            start=jnp.asarray(start),
+            held=jnp.asarray(held),
+            force_unknown=jnp.asarray(force_unknown),
+            to=jnp.asarray(to),
+        )
 
     def _allowed_gain(self, found: Outcome, *, more: float = 1.0) -> Float[np.ndarray, "k scenarios"]:
         """Gains, 0 where a limit would be passed or nothing finite is predicted; energies count `more` times."""
         allowed = (more * found.energy <= self._energy) & (found.force <= self._force)
         return np.where(allowed, np.nan_to_num(found.gain), 0.0)
 
-    def _safe(self, outlook: Outlook, tug: Tug, many: Float[Array, "_many n"], *, more: float = 1.0) -> bool:
+    def _safe(
+        self, predictor: PullPredictor, candidate: CandidatePull, many: Float[Array, "_many n"], *, more: float = 1.0
+    ) -> bool:
         """Whether the chance to pass a limit is small enough, by what one tug does in all scenarios."""
-        found, far = outcomes(outlook, tug, many, informative=False), NormalDist().inv_cdf(1 - self._limits.chance)
+        found, far = (
+            outcomes(predictor, candidate, many, informative=False),
+            NormalDist().inv_cdf(1 - self._limits.chance),
+        )
         for values, limit in ((jnp.sqrt(more * found.energy), self._energy**0.5), (found.force, self._force)):
             if not float(jnp.mean(values) + far * jnp.std(values)) <= limit:
                 return False
         return True
 
-    def _drawn(self, outlook: Outlook) -> tuple[Float[Array, "few n"], Float[Array, "many n"]]:
+    def _drawn(self, predictor: PullPredictor) -> tuple[Float[Array, "few n"], Float[Array, "many n"]]:
         self._key, one, other = jax.random.split(self._key, 3)
         unknown = jnp.asarray(self._limits.unknown)
-        return _scenarios(outlook, one, EXPECTED, unknown), _scenarios(outlook, other, JUDGED, unknown)
+        return _scenarios(predictor, one, EXPECTED, unknown), _scenarios(predictor, other, JUDGED, unknown)
 
 
-def underrated(outlook: Outlook, tug: Tug, s: Float[Array, "scenarios n"], *, least: float) -> float:
+def underrated(
+    predictor: PullPredictor, candidate: CandidatePull, s: Float[Array, "scenarios n"], *, least: float
+) -> float:
     """How many times the predicted energy what is seen amounts to, over scenarios in the median; at least 1.
 
     Args:
-        outlook: what is predicted from.
-        tug: to where the tip is, from where the particles are seen.
+        predictor: what is predicted from.
+        candidate: to where the tip is, from where the particles are seen.
         s: the scenarios.
         least: less than this is not predicted [J].
     """
-    squared = jnp.sum((tug.start[0] - outlook.balance.energy.rest) ** 2, axis=1)
-    b = outlook.balance.reference * s / (1 - s)
+    squared = jnp.sum((candidate.start[0] - predictor.balance.energy.rest) ** 2, axis=1)
+    b = predictor.balance.reference * s / (1 - s)
     seen = 0.5 * jnp.median(b @ squared) / len(squared)
-    predicted = jnp.median(outcomes(outlook, tug, s, informative=False).energy)
+    predicted = jnp.median(outcomes(predictor, candidate, s, informative=False).energy)
     return max(1.0, float(seen / jnp.maximum(predicted, least)))
 
 
 @eqx.filter_jit
-def _scenarios(outlook: Outlook, key: PRNGKeyArray, count: int, unknown: Float[Array, ""]) -> Float[Array, "count n"]:
-    return outlook.scenarios(key, count, unknown=unknown)
+def _scenarios(
+    predictor: PullPredictor, key: PRNGKeyArray, count: int, unknown: Float[Array, ""]
+) -> Float[Array, "count n"]:
+    return predictor.scenarios(key, count, unknown=unknown)

@@ -115,7 +115,7 @@ class Local(Controlled):
         return _local(self._loss, simulator, situation, self._scales)
 
 
-class Sampled(Controlled):
+class SampledController(Controlled):
     """SL-D: descend L_D from many samples of the workspace, and go towards the best."""
 
     def __init__(self, limits: Limits, *, seed: int) -> None:
@@ -168,7 +168,7 @@ def _large(
 
 
 PAPER: dict[str, Callable[..., Policy]] = {
-    "sl-d": Sampled,
+    "sl-d": SampledController,
     "lg-d": partial(Local, displacement_loss),
     "lg-h": partial(Local, entropy_loss),
 }

@@ -16,7 +16,7 @@ from jiggle_mj.regions import distance_to_path
 from ..belief.topology import region_of
 from ..estimator import Estimator
 from ..physics.mesh import SheetMesh
-from .information_policy import Information
+from .information_policy import InformationPolicy
 from .policy import Policy
 
 CYCLE = 40
@@ -32,13 +32,13 @@ FREE = 0.05
 """P(attached) up to which a place is known to be free. Inside a sheet of which nothing was seen it is 0.11."""
 
 
-class Procedure(Policy):
+class ProcedurePolicy(Policy):
     """Look, act, look again."""
 
     name: str
 
-    def __init__(self, look: Callable[..., Information]) -> None:
-        """`look` makes a fresh policy for each look at the tissue; takes `Information`'s `enough` and `about`."""
+    def __init__(self, look: Callable[..., InformationPolicy]) -> None:
+        """`look` makes a fresh policy for each look at the tissue; takes `InformationPolicy`'s `enough` and `about`."""
         super().__init__()
         self._fresh = look
         self._look, self._steps, self.acts = look(), 0, 0
@@ -71,7 +71,7 @@ class Procedure(Policy):
         """What to do now that the jaws are open and the tissue was looked at; or why nothing."""
 
     @abstractmethod
-    def check(self, estimator: Estimator, act: Cut | Suture) -> Information:
+    def check(self, estimator: Estimator, act: Cut | Suture) -> InformationPolicy:
         """Who looks at the tissue after an act."""
 
     def seen(self, estimator: Estimator) -> bool:
@@ -79,36 +79,38 @@ class Procedure(Policy):
         return False
 
 
-class Detach(Procedure):
+class Detach(ProcedurePolicy):
     """Cut whatever is found attached, until nothing is."""
 
     name = "detach"
 
     def act(self, estimator: Estimator) -> Cut | Suture | str:
-        """See `Procedure.act`."""
+        """See `ProcedurePolicy.act`."""
         found = estimator.detection.attached
         if not found.any():
             return f"nothing is found attached{' any more' if self.acts else ''}"
         mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
         return Cut(path=tour(mesh.rest[found, :2]), width=ROOM * mesh.spacing)
 
-    def check(self, estimator: Estimator, act: Cut | Suture) -> Information:
-        """See `Procedure.check`: whatever is still attached counts."""
+    def check(self, estimator: Estimator, act: Cut | Suture) -> InformationPolicy:
+        """See `ProcedurePolicy.check`: whatever is still attached counts."""
         return self._fresh(enough=CHECKED)
 
 
-class Sew(Procedure):
+class Sew(ProcedurePolicy):
     """Sew one free stretch, then see whether it holds."""
 
     name = "suture"
 
-    def __init__(self, look: Callable[..., Information], *, length: float, width: float, stiffness: float) -> None:
+    def __init__(
+        self, look: Callable[..., InformationPolicy], *, length: float, width: float, stiffness: float
+    ) -> None:
         """Of the stretch [m], and of each sewn particle's attachment [N/m]."""
         super().__init__(look)
         self._length, self._width, self._stiffness = length, width, stiffness
 
     def act(self, estimator: Estimator) -> Cut | Suture | str:
-        """See `Procedure.act`."""
+        """See `ProcedurePolicy.act`."""
         if self.acts:
             factor = estimator.worked(estimator.changes[-1])
             if factor is None:
@@ -122,12 +124,12 @@ class Sew(Procedure):
             return f"no stretch of {1e3 * self._length:.0f} mm is known to be free"
         return Suture(path=path, width=self._width, stiffness=self._stiffness)
 
-    def check(self, estimator: Estimator, act: Cut | Suture) -> Information:
-        """See `Procedure.check`: what was sewn, until it is known whether it holds."""
+    def check(self, estimator: Estimator, act: Cut | Suture) -> InformationPolicy:
+        """See `ProcedurePolicy.check`: what was sewn, until it is known whether it holds."""
         return self._fresh(enough=0.0, about=region_of(act, estimator.sheet.rest))
 
     def seen(self, estimator: Estimator) -> bool:
-        """See `Procedure.seen`."""
+        """See `ProcedurePolicy.seen`."""
         factor = estimator.worked(estimator.changes[-1]) if estimator.changes else None
         return factor is not None and abs(factor) >= CERTAIN
 

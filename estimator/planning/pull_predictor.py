@@ -29,14 +29,14 @@ from ..filters.force_balance import ForceBalance
 from ..physics.block_tridiagonal import lower_inverse
 
 
-class Tug(eqx.Module):
+class CandidatePull(eqx.Module):
     """Tissue in the jaws, and where these take it; one, or many in arrays."""
 
     start: Float[Array, "*many n 3"]
     """Positions to search from [m]."""
     held: Bool[Array, "*many n"]
-    loaded: Bool[Array, "*many n"]
-    """See `Evidence.loaded`."""
+    force_unknown: Bool[Array, "*many n"]
+    """See `Evidence.force_unknown`."""
     to: Float[Array, "*many n 3"]
     """Where the held particles go [m]; meaningless for the others."""
 
@@ -54,7 +54,7 @@ class Outcome(eqx.Module):
     """Largest on one attachment [N]."""
 
 
-class Outlook(eqx.Module):
+class PullPredictor(eqx.Module):
     """What is predicted from: the sheet's model, the belief, and how well a particle is seen."""
 
     balance: ForceBalance
@@ -75,7 +75,7 @@ class Outlook(eqx.Module):
         belief: AttachmentBelief,
         precision: Float[Array, "3 3"],
         about: Bool[Array, " n"],
-    ) -> "Outlook":
+    ) -> "PullPredictor":
         """With what does not depend on the pull worked out once."""
         mixture, gaussian = _believed(belief)
         return cls(
@@ -117,32 +117,34 @@ class Outlook(eqx.Module):
         noise = 1 / jnp.maximum(1 / better - 1 / self.known, FAINT)
         return jnp.sum(jnp.where(self.about, expected_fall(self.mixture, noise), 0.0))
 
-    def outcome(self, tug: Tug, s: Float[Array, " n"], *, informative: bool = True) -> Outcome:
+    def outcome(self, candidate: CandidatePull, s: Float[Array, " n"], *, informative: bool = True) -> Outcome:
         """Of a tug in a scenario; the gain costs as much as the rest, and is 0 where it is not asked for.
 
         Two programs, so that what is the same with and without the gain is compiled once.
         """
-        found = self.ending(tug, s)
-        return eqx.tree_at(lambda one: one.gain, found, self.shown(tug, s, found.x)) if informative else found
+        found = self.ending(candidate, s)
+        return eqx.tree_at(lambda one: one.gain, found, self.shown(candidate, s, found.x)) if informative else found
 
     @eqx.filter_jit
-    def ending(self, tug: Tug, s: Float[Array, " n"]) -> Outcome:
+    def ending(self, candidate: CandidatePull, s: Float[Array, " n"]) -> Outcome:
         """Where a tug ends in a scenario and what it asks of the attachments; nothing is said of the gain."""
         balance = self.balance
-        x = balance.predict(jnp.where(tug.held[:, None], tug.to, tug.start), s, self._seen(tug, tug.to))
+        x = balance.predict(
+            jnp.where(candidate.held[:, None], candidate.to, candidate.start), s, self._seen(candidate, candidate.to)
+        )
         b, squared = balance.reference * s / (1 - s), jnp.sum((x - balance.energy.rest) ** 2, axis=1)
         force = jnp.max(b * jnp.sqrt(squared))
         return Outcome(x=x, gain=jnp.zeros(()), energy=0.5 * b @ squared / len(s), force=force)
 
     @eqx.filter_jit
-    def shown(self, tug: Tug, s: Float[Array, " n"], x: Float[Array, "n 3"]) -> Float[Array, ""]:
+    def shown(self, candidate: CandidatePull, s: Float[Array, " n"], x: Float[Array, "n 3"]) -> Float[Array, ""]:
         """Gain by a look at where a tug ends in a scenario [nat]."""
-        frame = self.balance.linearise(x, s, self._seen(tug, x))
+        frame = self.balance.linearise(x, s, self._seen(candidate, x))
         return self.gain(self.balance.information(frame, self.balance.fit(frame)).precision)
 
-    def _seen(self, tug: Tug, y: Float[Array, "n 3"]) -> Evidence:
+    def _seen(self, candidate: CandidatePull, y: Float[Array, "n 3"]) -> Evidence:
         precision = jnp.broadcast_to(self.precision[None], (len(y), 3, 3))
-        return Evidence(y=y, precision=precision, held=tug.held, loaded=tug.loaded)
+        return Evidence(y=y, precision=precision, held=candidate.held, force_unknown=candidate.force_unknown)
 
 
 @eqx.filter_jit

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jiggle_mj.errors import OptionError
 
 
-class Tweezer(eqx.Module):
+class ToolKinematics(eqx.Module):
     """A tool whose frame has its origin at the tip, and jaws on hinges that are closed at 0."""
 
     model: Any
@@ -26,7 +26,7 @@ class Tweezer(eqx.Module):
     """Angles of the jaws, closed and as far open as they go [rad]."""
 
     @classmethod
-    def read(cls, mjcf: str) -> "Tweezer":
+    def read(cls, mjcf: str) -> "ToolKinematics":
         """Compile a tool.
 
         Args:
@@ -78,8 +78,8 @@ class Tweezer(eqx.Module):
 
 
 @eqx.filter_jit
-def clearances(tweezer: Tweezer, tips: Float[Array, "k 3"], quat_wxyz: Float[Array, " 4"]) -> Float[Array, " k"]:
-    """See `Tweezer.clearance`; of many tips at once [m]."""
+def clearances(tweezer: ToolKinematics, tips: Float[Array, "k 3"], quat_wxyz: Float[Array, " 4"]) -> Float[Array, " k"]:
+    """See `ToolKinematics.clearance`; of many tips at once [m]."""
     return jax.vmap(lambda tip: tweezer.clearance(tip, quat_wxyz))(tips)
 
 

@@ -10,7 +10,7 @@ from jiggle_mj.limits import Limits
 from jiggle_mj.observation import ToolState
 
 from ..estimator import Estimator
-from .tool_kinematics import Tweezer, clearances
+from .tool_kinematics import ToolKinematics, clearances
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,11 +23,11 @@ class Workspace:
     """Upper corner [m]."""
     bed: float
     """Height of the bed, on which the sheet rests with half its thickness [m]."""
-    tweezer: Tweezer | None
+    tweezer: ToolKinematics | None
     """If None, nothing but the tip is known of the tool."""
 
     @classmethod
-    def around(cls, estimator: Estimator, limits: Limits, tweezer: Tweezer | None = None) -> "Workspace":
+    def around(cls, estimator: Estimator, limits: Limits, tweezer: ToolKinematics | None = None) -> "Workspace":
         """The resting sheet, and the limits beside and above it."""
         rest = estimator.sheet.rest
         bottom, top = rest.min(axis=0), rest.max(axis=0)

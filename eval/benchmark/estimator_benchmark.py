@@ -108,7 +108,7 @@ def case(n: int) -> Case:
         x = search(gripped, b, x, force_tolerance=1e-6).x
         noisy = x + NOISE * jnp.asarray(draw.normal(size=x.shape))
         pull = Pull(before=before, tip=tip, length=grip.length)
-        frames.append(Evidence(y=noisy, precision=precision, held=held, loaded=held, pull=pull))
+        frames.append(Evidence(y=noisy, precision=precision, held=held, force_unknown=held, pull=pull))
     return Case(
         mesh=mesh,
         declaration=declaration,
@@ -119,19 +119,19 @@ def case(n: int) -> Case:
     )
 
 
-def benchmark(sizes: tuple[int, ...], *, paper: bool, say: Callable[[str], None]) -> Metrics:
+def benchmark(sizes: tuple[int, ...], *, paper: bool, log: Callable[[str], None]) -> Metrics:
     """Times of the update, the equilibrium and an action of SL-D at each size, and of the paper's filter at the first.
 
     Args:
         sizes: particles, about; beyond `LARGEST` of the equilibrium alone.
         paper: measure the paper's filter and controller too, which takes minutes on a CPU.
-        say: told what comes next.
+        log: told what comes next.
     """
     metrics: Metrics = {"device": {"value": jax.devices()[0].device_kind, "unit": "name"}}
     with jax.enable_x64(True), one_thread():
         cases = {}
         for n in sizes:
-            say(f"n = {n}")
+            log(f"n = {n}")
             cases[n] = one = case(n)
             compiled, seconds = timed(_equilibrium(one))
             metrics[f"equilibrium_n{n}_s"] = {"value": seconds, "unit": "s"}
@@ -144,14 +144,14 @@ def benchmark(sizes: tuple[int, ...], *, paper: bool, say: Callable[[str], None]
             if n == sizes[0]:
                 metrics["found_share"] = {"value": _found_share(one), "unit": "share"}
             if paper and n == sizes[0]:
-                say(f"n = {n}, the paper's filter")
+                log(f"n = {n}, the paper's filter")
                 explicit = build_filter(one.mesh, one.declaration, EstimatorConfig(filter="explicit"))
                 _, slow = timed(partial(_last_frame, *explicit, one), repeats=3)
                 metrics[f"update_explicit_n{n}_s"] = {"value": slow, "unit": "s"}
                 metrics["update_explicit_over_implicit"] = {"value": slow / seconds, "unit": "ratio"}
         metrics["peak_memory"] = {"value": peak_memory(), "unit": "GiB"}
         for n in [n for n in sizes if n <= LARGEST] if paper else []:
-            say(f"n = {n}, the paper's controller")
+            log(f"n = {n}, the paper's controller")
             _, seconds = timed(sl_d(cases[n]), repeats=3)
             metrics[f"plan_sl_d_n{n}_s"] = {"value": seconds, "unit": "s"}
     for part in ("equilibrium", "update", "plan_sl_d"):
@@ -248,6 +248,6 @@ def _found_share(one: Case) -> float:
     for frame in one.frames:
         update = filter.update(belief, b, frame, x)
         belief, b, x = update.belief, update.b, update.x
-    stated = filter.release(belief)
-    assert stated is not None
-    return float(np.mean((np.asarray(stated.probability) > 0.5) == one.attached))
+    summary = filter.release(belief)
+    assert summary is not None
+    return float(np.mean((np.asarray(summary.probability) > 0.5) == one.attached))

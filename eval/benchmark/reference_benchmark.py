@@ -22,26 +22,26 @@ NAMED = 625
 PAIRS = 15
 
 
-def reference_benchmark(sizes: tuple[int, ...], *, say: Callable[[str], None]) -> Metrics:
+def reference_benchmark(sizes: tuple[int, ...], *, log: Callable[[str], None]) -> Metrics:
     """Times of the reference.
 
     Args:
         sizes: vertices, about.
-        say: told what comes next.
+        log: told what comes next.
     """
     metrics: Metrics = {"device": {"value": "cpu", "unit": "name"}}
     increments = {}
     for n in sizes:
-        say(f"{n} vertices")
+        log(f"{n} vertices")
         increments[n], steps = increment(sized(n))
         metrics[f"reference_increment_n{n}_s"] = {"value": increments[n], "unit": "s"}
         metrics[f"reference_increment_n{n}_steps"] = {"value": steps, "unit": "steps of 20 ms"}
     metrics |= growth("reference_increment", increments)
     if NAMED in increments:
         metrics["reference_increment_s"] = {"value": increments[NAMED], "unit": "s"}
-    say("stereo pairs")
+    log("stereo pairs")
     metrics["stereo_pair_s"] = {"value": stereo_pair(load_scene("arc")), "unit": "s"}
-    say("an episode")
+    log("an episode")
     metrics["reference_episode_s"] = {"value": episode(load_scene("arc")), "unit": "s"}
     return metrics
 

@@ -25,7 +25,7 @@ from .calibration import Calibration, calibration
 from .detection import DILATIONS, agreement, average_precision
 from .safety import borne
 from .tracking import tracking
-from .truth_transfer import CarriedTruth, carry
+from .truth_transfer import TransferredTruth, carry
 
 if TYPE_CHECKING:
     from jiggle_mj.estimator.planning.policy import Decision
@@ -143,23 +143,23 @@ def with_truth(
     truth: Truth,
 ) -> Json:
     """A copy of `unscored` with all that the truth decides; the truth is that at the last frame the estimator used."""
-    carried = carry(sheet, truth, estimates[-1].index if estimates else 0)
+    transferred = carry(sheet, truth, estimates[-1].index if estimates else 0)
     probability = detection.score if detection.probabilistic else None
-    judged = calibration(belief, carried.stiffness, carried.attached, probability=probability)
+    refined = calibration(belief, transferred.stiffness, transferred.attached, probability=probability)
     scored = copy.deepcopy(unscored)
     _section(scored, "detection").update(
         n_detected=int(detection.attached.sum()),
-        n_attached=int(carried.attached.sum()),
-        by_dilation=agreements(sheet, detection.attached, carried),
-        average_precision=average_precision(detection.score, carried.attached),
+        n_attached=int(transferred.attached.sum()),
+        by_dilation=agreements(sheet, detection.attached, transferred),
+        average_precision=average_precision(detection.score, transferred.attached),
     )
-    observable = carried.observable
+    observable = transferred.observable
     if observable is not None:
         _section(scored, "detection").update(
             n_observable=int(observable.sum()),
-            observable={"by_dilation": agreements(sheet, detection.attached, carried, knowable=observable)},
+            observable={"by_dilation": agreements(sheet, detection.attached, transferred, knowable=observable)},
         )
-    _section(scored, "calibration").update(vars(judged))
+    _section(scored, "calibration").update(vars(refined))
     _section(scored, "tracking").update(rms_m=tracking(sheet, estimates, truth).rms)
     _section(scored, "safety").update(_judged(_section(scored, "safety"), truth))
     if scored.get("procedure") is not None:
@@ -249,14 +249,14 @@ def read_result(path: Path) -> Json:
 def agreements(
     sheet: Sheet,
     detected: Bool[np.ndarray, " n"],
-    carried: CarriedTruth,
+    transferred: TransferredTruth,
     *,
     knowable: Bool[np.ndarray, " n"] | None = None,
 ) -> Json:
     """PCD, PUG and F1 by rings of dilation."""
     by_dilation: Json = {}
     for rings in DILATIONS:
-        one = agreement(detected, carried.attached, sheet.faces, rings, knowable=knowable)
+        one = agreement(detected, transferred.attached, sheet.faces, rings, knowable=knowable)
         by_dilation[str(rings)] = {"pcd": one.pcd, "pug": one.pug, "f1": one.f1}
     return by_dilation
 

@@ -31,7 +31,7 @@ PAIRS_AT_ONCE = 400_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class CarriedTruth:
+class TransferredTruth:
     """The truth on the estimator's particles at one moment."""
 
     attached: Bool[np.ndarray, " n"]
@@ -63,7 +63,7 @@ def stiffness_at(truth: Truth, frame: TruthFrame | None) -> Float[np.ndarray, " 
     return np.where(np.isnan(frame.stiffness) & ~truth.attached, 0.0, frame.stiffness)
 
 
-def carry(sheet: Sheet, truth: Truth, index: int) -> CarriedTruth:
+def carry(sheet: Sheet, truth: Truth, index: int) -> TransferredTruth:
     """The truth at observation `index` on the particles of `sheet`, and the loads up to it.
 
     Vertices further from the sheet than its edges are long stand for tissue that it does not have.
@@ -79,7 +79,7 @@ def carry(sheet: Sheet, truth: Truth, index: int) -> CarriedTruth:
 
     nearest = at_vertices[np.asarray(KDTree(truth.rest).query(sheet.rest)[1])]
     finite = np.isfinite(nearest)
-    return CarriedTruth(
+    return TransferredTruth(
         attached=np.isnan(nearest) | (nearest > 0),
         stiffness=np.where(finite, shared(np.where(np.isfinite(at_vertices), at_vertices, 0.0)), nearest),
         load=shared(np.sqrt(np.sum(np.square(loads), axis=0))) if loads else None,

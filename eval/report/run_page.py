@@ -28,7 +28,7 @@ from ..metrics.calibration import reliability
 from ..metrics.detection import DILATIONS, GATE_VARIANCE, agreement, distances
 from ..metrics.flat_map import grid_of, outline, plane_of, spacing
 from ..metrics.tracking import tracking
-from ..metrics.truth_transfer import CarriedTruth, carry, frame_at, stiffness_at
+from ..metrics.truth_transfer import TransferredTruth, carry, frame_at, stiffness_at
 from .pictures import pictures, state_of
 from .verdict import against_truth, doubts, found, stiffness_sums
 
@@ -77,10 +77,10 @@ def write_report(
         raise ValueError("write_report needs at least one Estimate; got none (every frame was skipped?).")
     if images is not None and camera is None:
         raise ValueError("write_report got images without their camera; pass camera=StereoCamera(...).")
-    carried = None if truth is None else carry(sheet, truth, estimates[-1].index)
+    transferred = None if truth is None else carry(sheet, truth, estimates[-1].index)
     kept = shown_steps(estimates, sheet.rest)
     pairs = [] if images is None or camera is None else pictures(estimates, images, camera, kept)
-    payload = _payload(sheet, estimates, belief, detection, truth, carried)
+    payload = _payload(sheet, estimates, belief, detection, truth, transferred)
     payload["opening"] = _opening(estimates, kept, sheet.rest)
     payload["pictures"] = [
         {
@@ -99,9 +99,12 @@ def write_report(
     page.filters.update(number=_text, percent=_percent, milli=_milli)
     beside = None
     sentences = [found(sheet, detection, plane_of(sheet.rest))]
-    if truth is not None and carried is not None:
-        beside = _beside(sheet, estimates, belief, detection, truth, carried)
-        sentences += [against_truth(sheet, detection, carried), stiffness_sums(sheet, belief, detection, carried)]
+    if truth is not None and transferred is not None:
+        beside = _beside(sheet, estimates, belief, detection, truth, transferred)
+        sentences += [
+            against_truth(sheet, detection, transferred),
+            stiffness_sums(sheet, belief, detection, transferred),
+        ]
     sentences += doubts(result)
     text = page.from_string((here / "report.html").read_text("utf-8")).render(
         result=result,
@@ -131,21 +134,21 @@ def _payload(
     belief: Belief,
     detection: Detection,
     truth: Truth | None,
-    carried: CarriedTruth | None,
+    transferred: TransferredTruth | None,
 ) -> dict[str, object]:
     plane, last = plane_of(sheet.rest), estimates[-1]
     flat = plane.flatten(sheet.rest) * 1e3
     true_b = None if truth is None else stiffness_at(truth, frame_at(truth, last.index))
     most = math.inf if belief.reference is None else MOST_DRAWN * belief.reference
-    finite = [] if carried is None else carried.stiffness[np.isfinite(carried.stiffness)].tolist()
+    finite = [] if transferred is None else transferred.stiffness[np.isfinite(transferred.stiffness)].tolist()
     top = max([min(float(detection.stiffness.max()), most), *finite]) or 1.0
     x, y, corners, weights = grid_of(flat, sheet.faces)
     grids = {"x": _fixed(x, 2), "y": _fixed(y, 2)}
     fields = {"mean": detection.stiffness, "sd": detection.stiffness_sd}
     if detection.probabilistic:
         fields["probability"] = detection.score
-    if carried is not None:
-        fields["truth"] = np.where(np.isfinite(carried.stiffness), carried.stiffness, top)
+    if transferred is not None:
+        fields["truth"] = np.where(np.isfinite(transferred.stiffness), transferred.stiffness, top)
     for name, values in fields.items():
         grids[name] = _significant(np.sum(values[corners] * weights, axis=-1))
     kept = shown_steps(estimates, sheet.rest)
@@ -179,11 +182,11 @@ def _payload(
             for step in kept
         ],
         "truth": None
-        if truth is None or true_b is None or carried is None
+        if truth is None or true_b is None or transferred is None
         else {
-            "attached": carried.attached.astype(int).tolist(),
-            "stiffness": _significant(carried.stiffness),
-            "welded": np.isinf(carried.stiffness).astype(int).tolist(),
+            "attached": transferred.attached.astype(int).tolist(),
+            "stiffness": _significant(transferred.stiffness),
+            "welded": np.isinf(transferred.stiffness).astype(int).tolist(),
             "outline": _fixed(outline(plane.flatten(truth.rest) * 1e3, truth.faces, ~(true_b == 0)), 2),
             "faces": truth.faces.T.tolist(),
             "steps": _truth_steps(truth, estimates, kept, top),
@@ -231,7 +234,7 @@ def _beside(
     belief: Belief,
     detection: Detection,
     truth: Truth,
-    carried: CarriedTruth,
+    transferred: TransferredTruth,
 ) -> dict[str, object]:
     """Figures that `result.json` has no key for."""
     certain = detection.stiffness_sd**2 <= GATE_VARIANCE
@@ -239,13 +242,13 @@ def _beside(
     places, held_at = sheet.rest[detection.attached], truth.rest[~(true_b == 0)]
     return {
         "gated": {
-            str(rings): agreement(detection.attached, carried.attached, sheet.faces, rings, certain=certain)
+            str(rings): agreement(detection.attached, transferred.attached, sheet.faces, rings, certain=certain)
             for rings in DILATIONS
         },
         "uncertain": int((~certain).sum()),
         "to_truth": distances(places, held_at),
         "to_detection": distances(held_at, places),
-        "reliability": reliability(detection.score, carried.attached) if detection.probabilistic else [],
+        "reliability": reliability(detection.score, transferred.attached) if detection.probabilistic else [],
         "rms_estimate": tracking(sheet, estimates, truth).rms_estimate,
     }
 

@@ -9,7 +9,7 @@ from jiggle_mj.estimate import Belief, Detection, Sheet
 
 from ..metrics.detection import dilate, patches
 from ..metrics.flat_map import Plane
-from ..metrics.truth_transfer import CarriedTruth
+from ..metrics.truth_transfer import TransferredTruth
 
 POOR_FIT = 1.5
 """A noise that is wider by more than this is worth a word."""
@@ -36,9 +36,9 @@ def found(sheet: Sheet, detection: Detection, plane: Plane) -> str:
     return f"{total} {verb} reported attached, {counted} ({listed}), at {stiffness:.2g} N/m each on average."
 
 
-def against_truth(sheet: Sheet, detection: Detection, carried: CarriedTruth) -> str:
+def against_truth(sheet: Sheet, detection: Detection, transferred: TransferredTruth) -> str:
     """How many of the reported are right, and how many of the attached were found, exactly and within one ring."""
-    detected, attached = detection.attached, carried.attached
+    detected, attached = detection.attached, transferred.attached
     n_detected, n_attached = int(detected.sum()), int(attached.sum())
     if not n_attached:
         return "In truth nothing is attached." + (f" All {n_detected} reports are false." if n_detected else "")
@@ -53,14 +53,14 @@ def against_truth(sheet: Sheet, detection: Detection, carried: CarriedTruth) -> 
     return text + "."
 
 
-def stiffness_sums(sheet: Sheet, belief: Belief, detection: Detection, carried: CarriedTruth) -> str:
+def stiffness_sums(sheet: Sheet, belief: Belief, detection: Detection, transferred: TransferredTruth) -> str:
     """Over the attached particles and one ring around them: the estimated sum of b, its deviation, and the true one."""
-    if not carried.attached.any() or not np.isfinite(carried.stiffness).all():
+    if not transferred.attached.any() or not np.isfinite(transferred.stiffness).all():
         return ""
-    near = dilate(carried.attached, sheet.faces, 1)
+    near = dilate(transferred.attached, sheet.faces, 1)
     sd = belief.deviation_of_sum(detection.stiffness, near)
     stated = f"a stated standard deviation of {sd:.1f}" if np.isfinite(sd) else "no stated deviation"
-    total, true = detection.stiffness[near].sum(), carried.stiffness[near].sum()
+    total, true = detection.stiffness[near].sum(), transferred.stiffness[near].sum()
     return f"Over these and one ring around them b sums to {total:.1f} N/m, with {stated}; the truth is {true:.1f}."
 
 

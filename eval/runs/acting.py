@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from jiggle_mj.errors import OptionError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
-from jiggle_mj.estimator.planning.information_policy import Information
+from jiggle_mj.estimator.planning.information_policy import InformationPolicy
 from jiggle_mj.estimator.planning.paper_policies import PAPER, Primitive
 from jiggle_mj.estimator.planning.policy import Policy
-from jiggle_mj.estimator.planning.procedures import Detach, Procedure, Sew
-from jiggle_mj.estimator.planning.tool_kinematics import Tweezer
+from jiggle_mj.estimator.planning.procedures import Detach, ProcedurePolicy, Sew
+from jiggle_mj.estimator.planning.tool_kinematics import ToolKinematics
 from jiggle_mj.observation import Action
 from jiggle_mj.policies import POLICIES, PRIMITIVES
 
@@ -44,7 +44,7 @@ def policy_named(name: str | None, scene: "Scene", *, seed: int) -> Policy | Non
         return PAPER[name](limits, seed=seed)
     if name in PRIMITIVES:
         return Primitive(name.removeprefix("pmp-"))
-    look = partial(Information, limits, radius=scene.tweezer.radius, seed=seed, tweezer=_tweezer())
+    look = partial(InformationPolicy, limits, radius=scene.tweezer.radius, seed=seed, tweezer=_tweezer())
     if name == "information":
         return look()
     if name == "one-grasp":
@@ -56,10 +56,10 @@ def policy_named(name: str | None, scene: "Scene", *, seed: int) -> Policy | Non
 
 
 @cache
-def _tweezer() -> Tweezer:
+def _tweezer() -> ToolKinematics:
     from jiggle_mj.scenes.tissue.model import TWEEZER
 
-    return Tweezer.read(TWEEZER.read_text(encoding="utf-8"))
+    return ToolKinematics.read(TWEEZER.read_text(encoding="utf-8"))
 
 
 def check_goes_with(policy: Policy, config: EstimatorConfig) -> None:
@@ -68,7 +68,7 @@ def check_goes_with(policy: Policy, config: EstimatorConfig) -> None:
     Raises:
         OptionError: it predicts pulls, and the filter is not the one that can.
     """
-    if isinstance(policy, Information | Procedure) and config.filter != "implicit":
+    if isinstance(policy, InformationPolicy | ProcedurePolicy) and config.filter != "implicit":
         raise OptionError(
             f"information, one-grasp, detach and suture plan with the filter 'implicit'; got {config.filter!r}. "
             "Leave --estimator out, or choose a policy of the paper's."
@@ -93,7 +93,7 @@ def actions(
 
 def acts(policy: Policy | None, estimator: Estimator) -> Json | None:
     """The procedure's part of result.json: each cut or suture with the evidence that it worked; None if it is none."""
-    if not isinstance(policy, Procedure):
+    if not isinstance(policy, ProcedurePolicy):
         return None
     seen: list[object] = [
         {"frame": one.index, "kind": type(one.event).__name__.lower(), "log_bayes_factor": estimator.worked(one)}
@@ -115,12 +115,12 @@ def most_actions(scene: "Scene", name: str | None, steps: int | None = None) -> 
 def _most(policy: Policy, steps: int | None) -> int:
     if steps is not None and steps < 1:
         raise OptionError(f"steps = {steps}: must be at least 1.")
-    return steps or (LONG if isinstance(policy, Procedure) else STEPS)
+    return steps or (LONG if isinstance(policy, ProcedurePolicy) else STEPS)
 
 
 def _beginning(scene: "Scene", policy: Policy) -> Iterator[Action]:
     from jiggle_mj.scenes.scene.programme import opening, still
 
-    if isinstance(policy, Information):
+    if isinstance(policy, InformationPolicy):
         return still(scene) if policy.regrasps else opening(scene, height=0.0)
-    return still(scene) if isinstance(policy, Procedure) else opening(scene)
+    return still(scene) if isinstance(policy, ProcedurePolicy) else opening(scene)

@@ -18,8 +18,8 @@ from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.estimator.attribution.closing import close_the_loop
+from jiggle_mj.estimator.attribution.dataset import collect_dataset
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
-from jiggle_mj.estimator.attribution.gather import gather
 from jiggle_mj.estimator.attribution.suggestion import suggest
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
@@ -45,7 +45,7 @@ def close_loop(
     overwrite: bool = False,
     allow_truncated: bool = False,
     on_frame: OnFrame = lambda observation, found: None,
-    say: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Find what the model lacks of a recording, add it, and report the error before and after.
 
@@ -58,7 +58,7 @@ def close_loop(
         overwrite: replace an earlier run's files.
         allow_truncated: use what is whole of a recording that was cut off.
         on_frame: called after each frame of the first estimate.
-        say: told what is being done.
+        log: told what is being done.
 
     Returns:
         The content of discrepancy.json.
@@ -71,11 +71,13 @@ def close_loop(
     own = (DISCREPANCY, PAGE)
     check_directory(directory, own, overwrite=overwrite)
     clear_directory(directory, own)
-    gathered = gather(recording.declaration, recording.camera, recording, config=EstimatorConfig(), on_frame=on_frame)
+    dataset = collect_dataset(
+        recording.declaration, recording.camera, recording, config=EstimatorConfig(), on_frame=on_frame
+    )
     with jax.enable_x64(True), one_thread():
-        closed = close_the_loop(gathered, library=library, say=say)
-        found = made_by() | discrepancy(closed, gathered)
-    sheet, name = gathered.estimator.sheet, recording.metadata.get("name", recording_path.stem)
+        closed = close_the_loop(dataset, library=library, log=log)
+        found = made_by() | discrepancy(closed, dataset)
+    sheet, name = dataset.estimator.sheet, recording.metadata.get("name", recording_path.stem)
 
     def keep() -> None:
         (directory / DISCREPANCY).write_text(json.dumps(found, indent=1) + "\n")
@@ -86,22 +88,22 @@ def close_loop(
         true = read_truth(truth)
         if true.identity != recording.metadata.get("identity", ""):
             raise RecordingError(f"{truth} is not the truth of {recording_path}.")
-        last = gathered.frames[-1].index
+        last = dataset.frames[-1].index
         for when, fitted in (("before", closed.stages[0].fitted), ("after", closed.final)):
             found[f"detection_{when}"] = _scored(sheet, fitted.attached, true, last)
         keep()
     if suggestion:
         with jax.enable_x64(True), one_thread():
-            best = suggest(closed, gathered, say=say)
+            best = suggest(closed, dataset, log=log)
         found["suggestion"] = None if best is None else suggested(best)
         keep()
     return found
 
 
 def _scored(sheet: Sheet, detected: Bool[np.ndarray, " n"], truth: Truth, index: int) -> Json:
-    carried = carry(sheet, truth, index)
+    transferred = carry(sheet, truth, index)
     return {
         "n_detected": int(detected.sum()),
-        "n_attached": int(carried.attached.sum()),
-        "by_dilation": agreements(sheet, detected, carried),
+        "n_attached": int(transferred.attached.sum()),
+        "by_dilation": agreements(sheet, detected, transferred),
     }

@@ -90,7 +90,7 @@ def run_scene(
     policy = policy or scene.programme.policy
     chooses, config = policy_named(policy, scene, seed=seed), config or EstimatorConfig()
     if chooses is not None:
-        config = replace(config, judging="frames")
+        config = replace(config, refinement="frames")
         check_goes_with(chooses, config)
     own = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
     check_directory(directory, own, overwrite=overwrite)
@@ -184,7 +184,7 @@ def run_estimator(
 
 
 def score_directory(
-    directory: Path, truth: Path, *, recording: Path | None = None, say: Callable[[str], None] = lambda _: None
+    directory: Path, truth: Path, *, recording: Path | None = None, log: Callable[[str], None] = lambda _: None
 ) -> Json:
     """Score an estimate that lies in a folder, and write its report anew with the truth beside it.
 
@@ -193,7 +193,7 @@ def score_directory(
         truth: the truth file.
         recording: what was estimated, for the report's pictures; if None, it is looked for beside the truth file and in
             the folder.
-        say: told if the report loses its pictures.
+        log: told if the report loses its pictures.
 
     Raises:
         RecordingError: the folder holds no estimate, the file no truth, or one of another recording.
@@ -208,7 +208,7 @@ def score_directory(
         candidates = (path for path in (beside, directory / RECORDING) if path != truth and path.exists())
         recording = next((path for path in candidates if _is_of(found, path)), None)
     if recording is None and figures["sensing"] == "stereo":
-        say("the recording is not beside the truth: the report has no pictures; pass --recording for them")
+        log("the recording is not beside the truth: the report has no pictures; pass --recording for them")
     _report(directory, found, figures, recording=recording, truth=true)
     return figures
 

@@ -29,7 +29,7 @@ from jiggle_mj.scenes.sensing.observer import Sensing
 from ..metrics.detection import dilate
 from ..metrics.safety import Borne, borne
 from ..metrics.score import Json, read_result
-from ..metrics.truth_transfer import CarriedTruth, carry
+from ..metrics.truth_transfer import TransferredTruth, carry
 from ..runs.experiment import run_scene
 from .main_table import carry_out, cell, finished, value
 
@@ -54,7 +54,7 @@ class Course:
     """By how much the entropy has fallen since the prior [nat]."""
     borne: Borne
     detected: Bool[np.ndarray, "steps n"]
-    truth: CarriedTruth
+    truth: TransferredTruth
     faces: np.ndarray
     result: Json
 
@@ -71,7 +71,7 @@ def measure(
     *,
     sensing: Sensing,
     executor: Executor,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> Runs:
     """Run what has not been run, and read all of it.
 
@@ -82,17 +82,17 @@ def measure(
         directory: holds a folder for each run.
         sensing: what the estimator sees.
         executor: runs several at a time.
-        say: told of each run that is done.
+        log: told of each run that is done.
     """
     names = {(scene, policy, seed): f"{scene}-{policy}-{sensing}-{seed}"
              for scene, policy, seed in product(scenes, policies, seeds)}  # fmt: skip
-    config = replace(EstimatorConfig(), judging="frames")
+    config = replace(EstimatorConfig(), refinement="frames")
     left = {
         name: partial(_run, scene, policy, seed, directory / name, sensing)
         for (scene, policy, seed), name in names.items()
         if finished(directory / name, config) is None
     }
-    carry_out(left, executor, say=say)
+    carry_out(left, executor, log=log)
     return {key: course(directory / name) for key, name in names.items()}
 
 

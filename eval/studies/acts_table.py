@@ -56,7 +56,7 @@ Verdicts = dict[tuple[str, int], list[Verdict]]
 
 
 def measure(
-    scenes: Iterable[str], seeds: Iterable[int], directory: Path, *, executor: Executor, say: Callable[[str], None]
+    scenes: Iterable[str], seeds: Iterable[int], directory: Path, *, executor: Executor, log: Callable[[str], None]
 ) -> Verdicts:
     """Run what has not been run by this version, and read all of it.
 
@@ -65,12 +65,12 @@ def measure(
         seeds: of noise and places.
         directory: holds a file for each scene and seed.
         executor: runs several at a time.
-        say: told of each that is done.
+        log: told of each that is done.
     """
     files = {(scene, seed): directory / f"{scene}-{seed}.json" for scene, seed in product(scenes, seeds)}
     left = {file.stem: partial(_run, *key, file) for key, file in files.items() if _read(file) is None}
     directory.mkdir(parents=True, exist_ok=True)
-    carry_out(left, executor, say=say)
+    carry_out(left, executor, log=log)
     return {key: _read(file) or [] for key, file in files.items()}
 
 

@@ -23,7 +23,7 @@ from ..runs.experiment import run_scene
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class MainRow:
     """One line of a table: the same scene and sensing over all seeds."""
 
     scene: str
@@ -31,7 +31,7 @@ class Row:
 
 
 MAIN = tuple(
-    Row(scene=scene, sensing=sensing)
+    MainRow(scene=scene, sensing=sensing)
     for sensing in ("stereo", "particles")
     for scene in ("arc", "line", "u_shape", "line_dot", "arc_line", "arc_soft", "arc_stiff", "arc_weld", "free")
 )
@@ -56,15 +56,15 @@ FIGURES = (
 
 
 def measure(
-    rows: Iterable[Row], seeds: Iterable[int], directory: Path, *, say: Callable[[str], None]
-) -> dict[Row, list[Json]]:
+    rows: Iterable[MainRow], seeds: Iterable[int], directory: Path, *, log: Callable[[str], None]
+) -> dict[MainRow, list[Json]]:
     """Run what has not been run, and read all results.
 
     Args:
         rows: of the table.
         seeds: of each row.
         directory: holds a folder for each run.
-        say: told of each run before it starts.
+        log: told of each run before it starts.
     """
     seeds, found = tuple(seeds), {}
     for row in rows:
@@ -73,32 +73,32 @@ def measure(
             folder = directory / f"{row.scene}-{row.sensing}-{seed}"
             done = finished(folder, EstimatorConfig())
             if done is None:
-                say(f"{row.scene}, {row.sensing}, seed {seed}")
+                log(f"{row.scene}, {row.sensing}, seed {seed}")
                 done = run_scene(load_scene(row.scene), folder, seed=seed, sensing=row.sensing, overwrite=True)
             found[row].append(done)
     return found
 
 
-def carry_out(runs: Mapping[str, Callable[[], object]], executor: Executor, *, say: Callable[[str], None]) -> None:
+def carry_out(runs: Mapping[str, Callable[[], object]], executor: Executor, *, log: Callable[[str], None]) -> None:
     """Runs by name, several at a time; the first that fails ends them, and what is finished stays.
 
     Args:
         runs: what to call, which must go through pickle.
         executor: calls it.
-        say: told of each run that is done.
+        log: told of each run that is done.
     """
     left = {executor.submit(run): name for name, run in runs.items()}
     try:
         for number, done in enumerate(as_completed(left), start=1):
             done.result()
-            say(f"{number} of {len(left)}: {left[done]}")
+            log(f"{number} of {len(left)}: {left[done]}")
     except BaseException:
         for waiting in left:
             waiting.cancel()
         raise
 
 
-def markdown(results: dict[Row, list[Json]]) -> str:
+def markdown(results: dict[MainRow, list[Json]]) -> str:
     """Mean over the seeds, and the range behind it where they differ."""
     lines = [
         "| scene | sensing | " + " | ".join(name for name, *_ in FIGURES) + " |",

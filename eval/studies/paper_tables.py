@@ -121,7 +121,7 @@ def cells() -> tuple[Cell, ...]:
 
 
 def measure(
-    table: PaperTable, cells: Iterable[Cell], seeds: Iterable[int], directory: Path, *, say: Callable[[str], None]
+    table: PaperTable, cells: Iterable[Cell], seeds: Iterable[int], directory: Path, *, log: Callable[[str], None]
 ) -> dict[Cell, list[Json]]:
     """Run what has not been run, and read all results.
 
@@ -130,7 +130,7 @@ def measure(
         cells: lines of the table.
         seeds: of the noise, for each line.
         directory: holds a folder for each run.
-        say: told of each run before it starts.
+        log: told of each run before it starts.
     """
     seeds, found = tuple(seeds), {}
     for one in cells:
@@ -139,7 +139,7 @@ def measure(
             name = f"{table.grasps}-{one.scene}-{one.reference}-{one.config.filter}-{seed}"
             done = finished(directory / name, one.config)
             if done is None:
-                say(f"{one.scene}, {one.reference}, {one.method}, seed {seed}")
+                log(f"{one.scene}, {one.reference}, {one.method}, seed {seed}")
                 done = run(one, table.grasps, seed, directory / name)
             found[one].append(done)
     return found
@@ -221,7 +221,7 @@ def settings_in_words(table: PaperTable, seeds: list[str]) -> str:
             f"hinges {shots.HINGE:.3g} k. Adam: rate {adam.RATE:g} k, {adam.STEPS} steps a frame.",
             f"{unscented.PATCHES} patches. Ours: attached where P > 0.5, with P / (1 - P) beforehand of",
             f"{implicit.PROBABILITY / (1 - implicit.PROBABILITY):.3g} times e^{implicit.COUPLING:g}",
-            f"for each attached neighbour, and b / (b + k) from {implicit.RUNGS[0]:g} up where attached.",
+            f"for each attached neighbour, and b / (b + k) from {implicit.COMPONENTS[0]:g} up where attached.",
             "Printed: one run each, b* = 0.1, b_thresh = 0.05, no units, no noise.",
         )
     )

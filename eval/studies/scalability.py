@@ -1,8 +1,8 @@
 """How planning grows with the sheet: seconds for one action of the paper's SL-D and for one of ours, at each size.
 
-SL-D: 100 samples, five iterations. Ours, as `Information` plans where the jaws are: all pulls in one tissue and the
-likeliest in another for what they teach; the place of the tip in sixteen, for what the energy was predicted to be; and
-one step in sixteen, for whether it is safe. Other places are not looked at. Compilation is not counted.
+SL-D: 100 samples, five iterations. Ours, as `InformationPolicy` plans where the jaws are: all pulls in one tissue and
+the likeliest in another for what they teach; the place of the tip in sixteen, for what the energy was predicted to be;
+and one step in sixteen, for whether it is safe. Other places are not looked at. Compilation is not counted.
 """
 
 from collections.abc import Callable, Iterable
@@ -18,7 +18,7 @@ from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
 from jiggle_mj.estimator.planning.information_policy import EXPECTED, JUDGED, LIKELY, PULLS
 from jiggle_mj.estimator.planning.outcomes import outcomes
-from jiggle_mj.estimator.planning.pull_predictor import Outlook, Tug
+from jiggle_mj.estimator.planning.pull_predictor import CandidatePull, PullPredictor
 
 from ..benchmark.estimator_benchmark import NOISE, Case, case, sl_d, timed
 
@@ -30,12 +30,12 @@ Times = dict[int, tuple[float, float]]
 """Seconds of SL-D and ours, by size."""
 
 
-def scalability(sizes: Iterable[int], *, say: Callable[[str], None]) -> Times:
-    """Measure on whatever device is there; `say` is told what comes next."""
+def scalability(sizes: Iterable[int], *, log: Callable[[str], None]) -> Times:
+    """Measure on whatever device is there; `log` is told what comes next."""
     found: Times = {}
     with jax.enable_x64(True), one_thread():
         for n in sizes:
-            say(f"n = {n}")
+            log(f"n = {n}")
             one = case(n)
             _, theirs = timed(sl_d(one), repeats=3)
             _, ours = timed(our_plan(one), repeats=3)
@@ -44,29 +44,29 @@ def scalability(sizes: Iterable[int], *, say: Callable[[str], None]) -> Times:
 
 
 def our_plan(one: Case) -> Callable[[], object]:
-    """What `Information` asks of a grasp: what pulls teach, and whether the best is safe."""
+    """What `InformationPolicy` asks of a grasp: what pulls teach, and whether the best is safe."""
     filter, belief = build_filter(one.mesh, one.declaration, EstimatorConfig())
     assert isinstance(filter, ImplicitFilter) and isinstance(belief, AttachmentBelief)
     everywhere = jnp.ones(len(belief.shift), dtype=bool)
-    outlook = Outlook.build(filter.balance, belief, jnp.eye(3) / NOISE**2, everywhere)
+    predictor = PullPredictor.build(filter.balance, belief, jnp.eye(3) / NOISE**2, everywhere)
     pull, held = one.frames[-1].pull, one.frames[-1].held
     assert pull is not None
     ends = pull.before[None] + jnp.asarray(PULLS)[:, None]
     many = (len(PULLS), *held.shape)
-    tugs = Tug(
+    candidates = CandidatePull(
         start=jnp.broadcast_to(pull.before[None], ends.shape),
         held=jnp.broadcast_to(held[None], many),
-        loaded=jnp.broadcast_to(held[None], many),
+        force_unknown=jnp.broadcast_to(held[None], many),
         to=ends,
     )
-    likely, step = (jax.tree.map(lambda leaf, count=count: leaf[:count], tugs) for count in (LIKELY, 1))
-    here = eqx.tree_at(lambda tug: tug.to, step, step.start)
+    likely, step = (jax.tree.map(lambda leaf, count=count: leaf[:count], candidates) for count in (LIKELY, 1))
+    here = eqx.tree_at(lambda candidate: candidate.to, step, step.start)
     s = belief.bounded(one.b)
 
     def plan() -> object:
-        first, more, judged = (jnp.broadcast_to(s[None], (count, len(s))) for count in (1, EXPECTED - 1, JUDGED))
-        told = outcomes(outlook, tugs, first), outcomes(outlook, likely, more)
-        return told, [outcomes(outlook, tug, judged, informative=False) for tug in (here, step)]
+        first, more, refined = (jnp.broadcast_to(s[None], (count, len(s))) for count in (1, EXPECTED - 1, JUDGED))
+        told = outcomes(predictor, candidates, first), outcomes(predictor, likely, more)
+        return told, [outcomes(predictor, candidate, refined, informative=False) for candidate in (here, step)]
 
     return plan
 

@@ -43,7 +43,7 @@ from jiggle_mj.scenes.disturbances.sheet import (
     TissueCreep,
     TissueYield,
 )
-from jiggle_mj.scenes.disturbances.world import Bed, Friction, Gravity, ViscousDrag
+from jiggle_mj.scenes.disturbances.world import BedContact, Friction, Gravity, ViscousDrag
 from jiggle_mj.scenes.scene.attachments import Attachment
 from jiggle_mj.scenes.scene.disturbance import Disturbance
 from jiggle_mj.scenes.sensing.observer import Sensing
@@ -60,7 +60,7 @@ A sheet that is seen is no coarser than the mesh that is laid over it: else its 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class PanelRow:
     """One line of the table."""
 
     disturbances: tuple[Disturbance, ...] = ()
@@ -77,9 +77,9 @@ class Row:
     """True sizes of its effects, their first parameters, where they have some."""
 
 
-def _inside(effect: str, *disturbances: Disturbance, size: tuple[float, ...] = ()) -> Row:
+def _inside(effect: str, *disturbances: Disturbance, size: tuple[float, ...] = ()) -> PanelRow:
     """A row of one effect that the library has."""
-    return Row(effects=(effect,), disturbances=disturbances, sizes={effect: size} if size else {})
+    return PanelRow(effects=(effect,), disturbances=disturbances, sizes={effect: size} if size else {})
 
 
 LEAN, TOWARDS, TURN = np.radians(25), np.radians(30), np.radians(4)
@@ -88,12 +88,12 @@ LEANING = (np.sin(LEAN) * np.cos(TOWARDS), np.sin(LEAN) * np.sin(TOWARDS), 1 - n
 BITE = 0.003 * np.array([1.0, 0.3, 0.0]) / np.hypot(1.0, 0.3)
 """By which the anchors are shifted [m]."""
 
-INSIDE: dict[str, Row] = {
+INSIDE: dict[str, PanelRow] = {
     "gravity x 0.3": _inside("gravity", Gravity(magnitude=0.3, start=LATE), size=(0.0, 0.0, 0.7)),
     "gravity leaning": _inside(
         "gravity", Gravity(magnitude=1.0, tilt_deg=25, azimuth_deg=30, start=LATE), size=LEANING
     ),
-    "bed lower": _inside("bed", Bed(magnitude=-0.003, start=LATE), size=(-0.003, 0.0, 0.0)),
+    "bed lower": _inside("bed", BedContact(magnitude=-0.003, start=LATE), size=(-0.003, 0.0, 0.0)),
     # no size: contacts creep, and carry 0.25 to 0.53 of their load along the bed by the time a frame is taken
     "friction": _inside("friction", Friction(magnitude=1.0)),
     "viscous drag": _inside("viscous_drag", ViscousDrag(magnitude=2.0), MOVING),
@@ -124,16 +124,16 @@ INSIDE: dict[str, Row] = {
 """One effect of the library each."""
 
 
-def _together(*names: str) -> Row:
+def _together(*names: str) -> PanelRow:
     rows = [INSIDE[name] for name in names]
-    return Row(
+    return PanelRow(
         effects=tuple(effect for row in rows for effect in row.effects),
         disturbances=tuple(sorted((one for row in rows for one in row.disturbances), key=lambda one: one.start)),
         sizes={name: size for row in rows for name, size in row.sizes.items()},
     )
 
 
-TOGETHER: dict[str, Row] = {
+TOGETHER: dict[str, PanelRow] = {
     " and ".join(names): _together(*names)
     for names in (
         ("gravity x 0.3", "tool scale"),
@@ -145,27 +145,27 @@ TOGETHER: dict[str, Row] = {
     )
 }
 """Two effects at once."""
-IMAGES: dict[str, Row] = {
+IMAGES: dict[str, PanelRow] = {
     f"{name}, images": replace(INSIDE[name], sensing="stereo", spacing=SHIPPED)
     for name in ("gravity leaning", "stretch", "bed lower", "point pull", "tool scale", "image latency")
 }
 """The same from a stereo pair."""
-OUTSIDE: dict[str, Row] = {
-    "grasp slips": Row(disturbances=(GraspSlip(magnitude=0.006),)),
-    "tissue yields": Row(disturbances=(TissueYield(magnitude=0.1),)),
-    "anchors yield": Row(disturbances=(AnchorYield(magnitude=0.0015),)),
-    "anchors break": Row(disturbances=(AnchorBreak(magnitude=0.01),)),
+OUTSIDE: dict[str, PanelRow] = {
+    "grasp slips": PanelRow(disturbances=(GraspSlip(magnitude=0.006),)),
+    "tissue yields": PanelRow(disturbances=(TissueYield(magnitude=0.1),)),
+    "anchors yield": PanelRow(disturbances=(AnchorYield(magnitude=0.0015),)),
+    "anchors break": PanelRow(disturbances=(AnchorBreak(magnitude=0.01),)),
 }
 """What the library leaves out."""
-NOTHING: dict[str, Row] = {
-    "nothing": Row(),
-    "nothing, white noise": Row(smooth_share=0.0),
-    "nothing, shared noise": Row(smooth_share=0.8),
-    "nothing, finer reference": Row(sensing="points", spacing=3.25e-3),
-    "nothing, images": Row(sensing="stereo", spacing=SHIPPED),
-    "nothing, U shape": Row(layout="u_shape"),
-    "nothing, arc and line": Row(layout="arc_line"),
-    "nothing, disc": Row(layout="large_attach"),
+NOTHING: dict[str, PanelRow] = {
+    "nothing": PanelRow(),
+    "nothing, white noise": PanelRow(smooth_share=0.0),
+    "nothing, shared noise": PanelRow(smooth_share=0.8),
+    "nothing, finer reference": PanelRow(sensing="points", spacing=3.25e-3),
+    "nothing, images": PanelRow(sensing="stereo", spacing=SHIPPED),
+    "nothing, U shape": PanelRow(layout="u_shape"),
+    "nothing, arc and line": PanelRow(layout="arc_line"),
+    "nothing, disc": PanelRow(layout="large_attach"),
 }
 """Nothing that is undeclared: what is named there is a false alarm."""
 GROUPS = {"inside": INSIDE, "together": TOGETHER, "images": IMAGES, "outside": OUTSIDE, "nothing": NOTHING}

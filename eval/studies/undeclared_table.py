@@ -12,21 +12,21 @@ import numpy as np
 from scipy.stats import norm
 
 from jiggle_mj.episode import observe
-from jiggle_mj.estimator.attribution.closing import LEFT_OVER
+from jiggle_mj.estimator.attribution.closing import UNEXPLAINED
 from jiggle_mj.recording.declaration import is_current
 from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.scenes import Reference, programme
 
 from ..runs.closing_the_loop import DISCREPANCY, close_loop
 from .main_table import carry_out
-from .undeclared_panel import IMAGES, INSIDE, NOTHING, OUTSIDE, ROWS, TOGETHER, Row, scene_with
+from .undeclared_panel import IMAGES, INSIDE, NOTHING, OUTSIDE, ROWS, TOGETHER, PanelRow, scene_with
 
 Found = dict[tuple[str, int], dict[str, Any]]
 """discrepancy.json by what is undeclared and seed."""
 
 
 def measure(
-    names: Iterable[str], seeds: Iterable[int], directory: Path, *, executor: Executor, say: Callable[[str], None]
+    names: Iterable[str], seeds: Iterable[int], directory: Path, *, executor: Executor, log: Callable[[str], None]
 ) -> Found:
     """Run what has not been run by this version, and read all of it.
 
@@ -35,13 +35,13 @@ def measure(
         seeds: of mesh, noise and scene.
         directory: holds a folder for each.
         executor: runs several at a time.
-        say: told of each that is done.
+        log: told of each that is done.
     """
     folders = {(name, seed): directory / _folder(name, seed) for name, seed in product(names, seeds)}
     left = {
         folder.name: partial(_run, *key, folder) for key, folder in folders.items() if not _done(folder / DISCREPANCY)
     }
-    carry_out(left, executor, say=say)
+    carry_out(left, executor, log=log)
     return {key: json.loads((folder / DISCREPANCY).read_text()) for key, folder in folders.items()}
 
 
@@ -95,12 +95,12 @@ def _sums(runs: Found) -> list[str]:
     if nothing := [found for (name, _), found in runs.items() if name in NOTHING]:
         said.append(f"Nothing undeclared: {sum(bool(one['effects']) for one in nothing)} of {len(nothing)} named.")
     if outside := [found for (name, _), found in runs.items() if name in OUTSIDE]:
-        honest = sum(one["verdict"] in LEFT_OVER for one in outside)
+        honest = sum(one["verdict"] in UNEXPLAINED for one in outside)
         said.append(f"Not in the library: {honest} of {len(outside)} unexplained or with a remainder.")
     return said
 
 
-def _right(runs: list[tuple[Row, dict[str, Any]]]) -> str:
+def _right(runs: list[tuple[PanelRow, dict[str, Any]]]) -> str:
     """How often each effect of a row was added, and how often it was among those named."""
     added = sum({one["name"] for one in found["effects"]} >= set(row.effects) for row, found in runs)
     first = sum(found["effects"][:1] != [] and found["effects"][0]["name"] in row.effects for row, found in runs)
@@ -108,7 +108,7 @@ def _right(runs: list[tuple[Row, dict[str, Any]]]) -> str:
     return f"named first in {first} of {len(runs)}, all added in {added}, all among those named in {among}"
 
 
-def _covered(runs: list[tuple[Row, dict[str, Any]]]) -> str:
+def _covered(runs: list[tuple[PanelRow, dict[str, Any]]]) -> str:
     """How many parameters of effects that were added lie within 95 % intervals, of those with a true value."""
     within = [
         abs(theta - true) <= norm.ppf(0.975) * sd

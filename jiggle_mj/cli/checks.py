@@ -10,7 +10,7 @@ import tyro
 from rich.table import Table
 
 from .options import AsJson, Disturb, Name
-from .terminal import console, say
+from .terminal import console, log
 
 
 def bench(
@@ -35,9 +35,9 @@ def bench(
     if part == "reference":
         from jiggle_mj.eval.benchmark import reference_benchmark as reference
 
-        metrics = reference.reference_benchmark(sizes or reference.SIZES, say=say)
+        metrics = reference.reference_benchmark(sizes or reference.SIZES, log=log)
     else:
-        metrics = benchmark(sizes or SIZES, paper=True, say=say)
+        metrics = benchmark(sizes or SIZES, paper=True, log=log)
     table = Table("", "figure", "", box=None)
     for name, entry in metrics.items():
         value = entry["value"]
@@ -65,7 +65,7 @@ def scene_check(scene: Name, /, *, disturb: Disturb = (), as_json: AsJson = Fals
 
     loaded = disturbed(load_scene(scene), disturb)
     with console.status("load tests") as status:
-        found = load_tests(loaded, say=lambda text: status.update(f"load tests: {text}"))
+        found = load_tests(loaded, log=lambda text: status.update(f"load tests: {text}"))
     stated = typed(loaded.tissue)
     spacings = [f"{1e3 * one.spacing:.2f} mm" for one in found]
     table = Table("effective", "unit", "typed", *spacings, box=None)

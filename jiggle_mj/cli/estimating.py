@@ -184,7 +184,7 @@ def close_loop(
             allow_truncated=allow_truncated,
             overwrite=overwrite,
             on_frame=on_frame,
-            say=lambda text: console.print(text, highlight=False, markup=False),
+            log=lambda text: console.print(text, highlight=False, markup=False),
         )
     console.print(found["verdict"], style="bold")
     for sentence in story(found):
@@ -206,4 +206,4 @@ def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = N
     """
     from jiggle_mj.eval.runs.experiment import score_directory
 
-    show(score_directory(directory, truth, recording=recording, say=console.print), directory, as_json)
+    show(score_directory(directory, truth, recording=recording, log=console.print), directory, as_json)

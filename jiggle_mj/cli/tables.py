@@ -6,7 +6,7 @@ import tyro
 
 from ..errors import OptionError
 from .options import Out, RowsName, Sensing, TableName
-from .terminal import console, say
+from .terminal import console, log
 
 
 def table(
@@ -44,7 +44,7 @@ def table(
     if rows is not None and name != "undeclared":
         raise OptionError(f"--rows is for the table undeclared; got {name}.")
     if name == "main":
-        print(tables.markdown(tables.measure(tables.MAIN, seeds or range(3), out, say=say)))
+        print(tables.markdown(tables.measure(tables.MAIN, seeds or range(3), out, log=log)))
     elif name == "active":
         from jiggle_mj.eval.studies import active_table
 
@@ -58,7 +58,7 @@ def table(
                 out,
                 sensing=sensing or "particles",
                 executor=executor,
-                say=say,
+                log=log,
             )
         print(active_table.markdown(runs))
         active_table.write_curves(runs, out / active_table.FILE)
@@ -69,7 +69,7 @@ def table(
         from ..worker_processes import WorkerProcesses
 
         with WorkerProcesses(jobs) as executor:
-            found = acts_table.measure(acts_table.SCENES, seeds or range(6), out, executor=executor, say=say)
+            found = acts_table.measure(acts_table.SCENES, seeds or range(6), out, executor=executor, log=log)
         print(acts_table.markdown(found))
     elif name == "undeclared":
         from jiggle_mj.eval.studies import undeclared_table as undeclared
@@ -79,12 +79,12 @@ def table(
 
         names = [name for group in (rows or GROUPS) for name in GROUPS[group]]
         with WorkerProcesses(jobs) as executor:
-            closed = undeclared.measure(names, seeds or range(5), out, executor=executor, say=say)
+            closed = undeclared.measure(names, seeds or range(5), out, executor=executor, log=log)
         print(undeclared.markdown(closed))
     elif name == "scalability":
         from jiggle_mj.eval.studies import scalability
 
-        print(scalability.markdown(scalability.scalability(scalability.SIZES, say=say)))
+        print(scalability.markdown(scalability.scalability(scalability.SIZES, log=log)))
     else:
         table, cells = paper_tables.TABLES[name], paper_tables.cells()
-        print(paper_tables.markdown(table, paper_tables.measure(table, cells, seeds or range(10), out, say=say)))
+        print(paper_tables.markdown(table, paper_tables.measure(table, cells, seeds or range(10), out, log=log)))

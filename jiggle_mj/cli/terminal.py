@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 console = Console(stderr=True)
 
 
-def say(text: str) -> None:
+def log(text: str) -> None:
     """A line about long work."""
     console.print(text, highlight=False)
 
@@ -41,7 +41,7 @@ def patient() -> Iterator[Callable[[], bool]]:
         if noted:
             raise KeyboardInterrupt
         noted.append(number)
-        say("interrupted: what is under way comes to its end, and the results are written; again stops at once")
+        log("interrupted: what is under way comes to its end, and the results are written; again stops at once")
 
     before = signal.signal(signal.SIGINT, note)
     try:

@@ -19,7 +19,7 @@ class Stamped:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Moment:
+class MessageGroup:
     """The messages of one moment; None for one that is not there."""
 
     stamp: int
@@ -39,7 +39,7 @@ def group_moments(
     pose: list[Stamped],
     grasp: list[Stamped],
     tolerance: int,
-) -> list[Moment]:
+) -> list[MessageGroup]:
     """Moments in the order in which the file holds them, which need not be the order of their stamps.
 
     A left image takes the nearest right image within the tolerance that no earlier one took, and likewise a cloud.
@@ -55,17 +55,17 @@ def group_moments(
         tolerance: largest difference of stamps within a moment [ns].
     """
     rights, clouds = _Pool(right), _Pool(points)
-    sensors: list[tuple[Stamped, Moment]] = []
+    sensors: list[tuple[Stamped, MessageGroup]] = []
     if left or right:
         for image in left:
             mate, cloud = rights.take(image.stamp, tolerance), clouds.take(image.stamp, tolerance)
-            sensors.append((image, Moment(stamp=image.stamp, left=image, right=mate, points=cloud)))
-        sensors += [(image, Moment(stamp=image.stamp, right=image)) for image in rights.left_over()]
+            sensors.append((image, MessageGroup(stamp=image.stamp, left=image, right=mate, points=cloud)))
+        sensors += [(image, MessageGroup(stamp=image.stamp, right=image)) for image in rights.unexplained()]
     else:
-        sensors = [(cloud, Moment(stamp=cloud.stamp, points=cloud)) for cloud in points]
+        sensors = [(cloud, MessageGroup(stamp=cloud.stamp, points=cloud)) for cloud in points]
     poses, grasps = sorted(pose), sorted(grasp)
     return [
-        Moment(
+        MessageGroup(
             stamp=moment.stamp,
             left=moment.left,
             right=moment.right,
@@ -98,5 +98,5 @@ class _Pool:
             self._taken.add(nearest)
         return nearest
 
-    def left_over(self) -> list[Stamped]:
+    def unexplained(self) -> list[Stamped]:
         return [message for message in self._messages if message not in self._taken]

@@ -28,7 +28,7 @@ from .declaration import METADATA, file_metadata, write_declaration
 from .events import EVENT_SCHEMA, event_json
 from .frames import camera_transforms, transform_of_rotation
 from .mcap_files import McapOutput
-from .pairing import Moment, Stamped, group_moments
+from .pairing import MessageGroup, Stamped, group_moments
 from .schemas import (
     GRASP_SCHEMA,
     calibration_message,
@@ -192,7 +192,7 @@ class Recording:
             yield replace(observation, events=tuple(events), reports=self._reports(told, moment.pose))
             told = moment.pose
 
-    def _messages(self) -> Iterator[tuple[Moment, dict[str, Any]]]:
+    def _messages(self) -> Iterator[tuple[MessageGroup, dict[str, Any]]]:
         """Each moment with its images and points, still encoded; keeps only what a coming moment needs."""
         wanted = {message.ordinal: topic for moment in self._moments for topic, message in _parts(moment)}
         kept: dict[int, Any] = {}
@@ -204,7 +204,7 @@ class Recording:
                 yield moment, {topic: kept.pop(part.ordinal) for topic, part in _parts(moment)}
                 moment = next(coming, None)
 
-    def _observation(self, index: int, moment: Moment, messages: dict[str, Any]) -> Observation:
+    def _observation(self, index: int, moment: MessageGroup, messages: dict[str, Any]) -> Observation:
         images = None
         if moment.left is not None or moment.right is not None:
             images = self._images(messages)
@@ -263,7 +263,7 @@ class Recording:
         """In the world."""
         return self._contents.frames.T_world(pose.frame_id, POSE) @ parse_transform(pose.pose)
 
-    def _tool(self, moment: Moment) -> ToolState:
+    def _tool(self, moment: MessageGroup) -> ToolState:
         if moment.pose is None or moment.grasp is None:
             raise RecordingError("no tool pose or grasp has come yet")
         age = moment.stamp - moment.pose.stamp
@@ -281,7 +281,7 @@ class Recording:
         )
 
 
-def _parts(moment: Moment) -> list[tuple[str, Stamped]]:
+def _parts(moment: MessageGroup) -> list[tuple[str, Stamped]]:
     """The messages of a moment that are decoded when their turn comes, with their topics."""
     parts = ((LEFT, moment.left), (RIGHT, moment.right), (POINTS, moment.points))
     return [(topic, message) for topic, message in parts if message is not None]

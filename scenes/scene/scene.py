@@ -22,7 +22,7 @@ MOST = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tissue(Section):
+class TissueConfig(Section):
     """The sheet: a thin shell of St Venant-Kirchhoff material."""
 
     section: ClassVar[str] = "tissue"
@@ -46,7 +46,7 @@ class Tissue(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bed(Section):
+class BedConfig(Section):
     """The plane that the tissue lies on."""
 
     section: ClassVar[str] = "bed"
@@ -56,7 +56,7 @@ class Bed(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tweezer(Section):
+class TweezerConfig(Section):
     """The tool."""
 
     section: ClassVar[str] = "tweezer"
@@ -67,7 +67,7 @@ class Tweezer(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Programme(Section):
+class ProgrammeConfig(Section):
     """Grasps and lifts, one point after the other."""
 
     section: ClassVar[str] = "programme"
@@ -89,7 +89,7 @@ class Programme(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Procedure(Section):
+class ProcedureConfig(Section):
     """How cuts and sutures turn out."""
 
     section: ClassVar[str] = "procedure"
@@ -110,7 +110,7 @@ class Procedure(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits(Section):
+class LimitsConfig(Section):
     """What a policy may ask of the attachments, and where it may take the tip."""
 
     section: ClassVar[str] = "limits"
@@ -133,7 +133,7 @@ class Limits(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera(Section):
+class CameraConfig(Section):
     """The stereo pair, looking at a point from a distance, tilted about the world's x axis."""
 
     section: ClassVar[str] = "camera"
@@ -151,7 +151,7 @@ class Camera(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lights(Section):
+class LightsConfig(Section):
     """An even light and one lamp beside the camera; intensities in [0, 1]."""
 
     section: ClassVar[str] = "lights"
@@ -162,7 +162,7 @@ class Lights(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Texture(Section):
+class TextureConfig(Section):
     """The looks of tissue and bed, drawn from a seed."""
 
     section: ClassVar[str] = "texture"
@@ -174,7 +174,7 @@ class Texture(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sensing(Section):
+class SensingConfig(Section):
     """Noise of what the estimator is given."""
 
     section: ClassVar[str] = "sensing"
@@ -192,7 +192,7 @@ class Sensing(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Declared(Section):
+class DeclaredConfig(Section):
     """What the user tells the estimator before anything is seen. It may differ from the tissue."""
 
     section: ClassVar[str] = "declared"
@@ -222,22 +222,22 @@ class Scene:
     name: str
     seed: int = 0
     """With the seed of a run it draws the sensing noise, so that two scenes never share theirs."""
-    tissue: Tissue = field(default_factory=Tissue)
-    bed: Bed = field(default_factory=Bed)
+    tissue: TissueConfig = field(default_factory=TissueConfig)
+    bed: BedConfig = field(default_factory=BedConfig)
     attachments: tuple[Attachment, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     """What nobody tells the estimator of, in the order in which they begin."""
     secret: bool = False
     """Whether nothing but the truth file may say that there are disturbances."""
-    tweezer: Tweezer = field(default_factory=Tweezer)
-    programme: Programme = field(default_factory=Programme)
-    procedure: Procedure = field(default_factory=Procedure)
-    limits: Limits = field(default_factory=Limits)
-    camera: Camera = field(default_factory=Camera)
-    lights: Lights = field(default_factory=Lights)
-    texture: Texture = field(default_factory=Texture)
-    sensing: Sensing = field(default_factory=Sensing)
-    declared: Declared = field(default_factory=Declared)
+    tweezer: TweezerConfig = field(default_factory=TweezerConfig)
+    programme: ProgrammeConfig = field(default_factory=ProgrammeConfig)
+    procedure: ProcedureConfig = field(default_factory=ProcedureConfig)
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    lights: LightsConfig = field(default_factory=LightsConfig)
+    texture: TextureConfig = field(default_factory=TextureConfig)
+    sensing: SensingConfig = field(default_factory=SensingConfig)
+    declared: DeclaredConfig = field(default_factory=DeclaredConfig)
 
     def __post_init__(self) -> None:
         """Check what spans several sections."""

@@ -17,7 +17,7 @@ from jiggle_mj.observation import MeasuredPoints, StereoPair, ToolReport
 
 from ..scene.disturbance import SensingDisturbance
 from ..tissue.cameras import place_cameras, stereo_camera
-from ..tissue.history import History
+from ..tissue.history import DelayedState
 from ..tissue.simulation import Simulation
 from . import points as sense
 from .stereo import StereoRenderer
@@ -90,7 +90,7 @@ class Observer:
         self._renderer = None
         if sensing == "stereo":
             self._renderer = StereoRenderer(simulation.model, scene.camera, gloss=scene.lights.specular)
-        self._history: History | None = None
+        self._history: DelayedState | None = None
         self._coming: list[SensingDisturbance] = []
         for place, one in enumerate(scene.disturbances):
             if isinstance(one, SensingDisturbance):
@@ -112,7 +112,7 @@ class Observer:
     def remember(self, longest: float) -> None:
         """Keep the past, as far back as `longest` [s]."""
         simulation = self.simulation
-        self._history = History(simulation.model, simulation.data, longest=longest)
+        self._history = DelayedState(simulation.model, simulation.data, longest=longest)
         simulation.rules.insert(0, self._history.record)  # before the tool reports
 
     def redraw(self) -> None:

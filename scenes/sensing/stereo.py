@@ -11,7 +11,7 @@ from jiggle_mj.errors import RenderError
 from jiggle_mj.observation import StereoPair
 
 from ..opengl import IMPORT_ERROR, no_opengl
-from ..scene.scene import Camera
+from ..scene.scene import CameraConfig
 from ..tissue.cameras import NAMES
 from .highlights import with_highlights
 
@@ -23,7 +23,7 @@ class StereoRenderer:
         RenderError: this machine has no offscreen OpenGL.
     """
 
-    def __init__(self, model: mujoco.MjModel, camera: Camera, *, gloss: float = 0.0) -> None:
+    def __init__(self, model: mujoco.MjModel, camera: CameraConfig, *, gloss: float = 0.0) -> None:
         self.gloss = gloss
         """Strength of the lamp's highlights on the tissue, from 0 to 1."""
         self._model = model

@@ -11,24 +11,24 @@ from jaxtyping import Float
 
 from jiggle_mj.camera import StereoCamera, as_recorded, optical_from_opengl
 
-from ..scene.scene import Camera
+from ..scene.scene import CameraConfig
 
 NAMES = ("left", "right")
 
 
-def _rotation(camera: Camera) -> Float[np.ndarray, "3 3"]:
+def _rotation(camera: CameraConfig) -> Float[np.ndarray, "3 3"]:
     """World axes of the OpenGL camera, as columns x (right), y (up), z (backwards)."""
     tilt = math.radians(camera.tilt_deg)
     return np.array([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]])
 
 
-def _position(camera: Camera, name: str) -> Float[np.ndarray, " 3"]:
+def _position(camera: CameraConfig, name: str) -> Float[np.ndarray, " 3"]:
     rotation = _rotation(camera)
     side = -0.5 if name == "left" else 0.5
     return np.array(camera.target) + camera.distance * rotation[:, 2] + side * camera.baseline * rotation[:, 0]
 
 
-def add_cameras(spec: mujoco.MjSpec, camera: Camera) -> None:
+def add_cameras(spec: mujoco.MjSpec, camera: CameraConfig) -> None:
     """Put both cameras into the world body."""
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, _rotation(camera).ravel())
@@ -46,7 +46,7 @@ def place_cameras(model: mujoco.MjModel, T_world_left: Float[np.ndarray, "4 4"],
         model.cam_pos[camera], model.cam_quat[camera] = T[:3, 3] + aside * T[:3, 0], quat
 
 
-def stereo_camera(camera: Camera) -> StereoCamera:
+def stereo_camera(camera: CameraConfig) -> StereoCamera:
     """The calibration that belongs to the rendered images, as a recording of them has it."""
     T_world_opengl = np.eye(4)
     T_world_opengl[:3, :3], T_world_opengl[:3, 3] = _rotation(camera), _position(camera, "left")

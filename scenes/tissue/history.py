@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 
-class History:
+class DelayedState:
     """The states after each step, as far back as the longest delay reaches."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, *, longest: float) -> None:

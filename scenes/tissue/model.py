@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from ..scene.attachments import owners, vertex_stiffness
 from ..scene.disturbance import TissueDisturbance
-from ..scene.scene import Scene, Texture
+from ..scene.scene import Scene, TextureConfig
 from .cameras import add_cameras
 from .mesh import Triangulation, build_sheet
 from .texture import bed_texture, tissue_texture
@@ -28,7 +28,7 @@ CONTACT_SOLREF, CONTACT_SOLIMP = (-2e3, -100.0), (0.99, 0.999, 1e-4, 0.5, 2.0)
 """Of the bed: a vertex weighs 16 mg, so MuJoCo's default lets a pull of 1 mN sink it by millimetres."""
 STRETCH_AND_BEND = 3
 """MuJoCo's `elastic2d="both"`."""
-PLAIN = Texture(resolution=64, contrast=0.0)
+PLAIN = TextureConfig(resolution=64, contrast=0.0)
 """Stands in where nothing is drawn."""
 TWEEZER = Path(__file__).parent.parent / "tweezer.xml"
 PARKED = (0.0, 0.0, 0.5)

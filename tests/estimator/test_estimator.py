@@ -10,7 +10,7 @@ import trimesh
 from jiggle_mj.errors import MeshError, PerceptionError, RecordingError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
-from jiggle_mj.estimator.filters.evidence import Stated
+from jiggle_mj.estimator.filters.evidence import PosteriorSummary
 from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
 from jiggle_mj.estimator.perception import Track
 from jiggle_mj.observation import DeclaredMesh, MeasuredPoints, Observation, StereoPair, ToolState
@@ -328,7 +328,7 @@ def test_a_belief_that_is_no_number_when_the_jaws_open_is_refused_and_the_last_o
         estimator.update(one)
     before, none = estimator.detection, jnp.full(sheet().n, jnp.nan)
     belief, no, yes = BoundaryBelief.prior(sheet().n, mean=0.0, sd=1.0), jnp.asarray(jnp.nan), jnp.asarray(True)
-    spoilt = Stated(belief=belief, b=none, sd=none, probability=none, entropy=no, converged=yes)
+    spoilt = PosteriorSummary(belief=belief, b=none, sd=none, probability=none, entropy=no, converged=yes)
     monkeypatch.setattr(NonNegativeLeastSquares, "release", lambda self, belief, thorough: spoilt)
     with pytest.raises(PerceptionError, match="leave no finite belief"):
         estimator.release()

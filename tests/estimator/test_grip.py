@@ -27,8 +27,8 @@ def test_it_turns_about_the_tip_by_as_much_as_the_tool_since_the_jaws_closed():
     before = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])
     after = Rotation.from_rotvec([0.0, np.pi / 2, 0.0]) * before
     hold = GripHold.close(tool(turn=before.as_rotvec()), POINTS, None)
-    turned = hold.turned(tool(turn=after.as_rotvec()))
-    np.testing.assert_allclose(turned[1], [-1e-3, 0.0, 0.0], atol=1e-15)  # about y: x to -z, and the tip is 1 mm above
+    rotated = hold.rotated(tool(turn=after.as_rotvec()))
+    np.testing.assert_allclose(rotated[1], [-1e-3, 0.0, 0.0], atol=1e-15)  # about y: x to -z, and the tip is 1 mm above
 
 
 def test_jaws_that_close_on_nothing_are_refused():

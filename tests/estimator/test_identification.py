@@ -46,8 +46,8 @@ def runs() -> list[tuple]:
     for seed in SEEDS:
         filter = ImplicitFilter(sheet_balance(1e-4).of(wrong))
         seen = [observed(frame, 100 * seed + i) for i, frame in enumerate(lifts())]
-        _, stated = follow(filter, lifts(), seen)
-        found.append(identify(filter, stated.belief, stated.b, on_pass=lambda _: None))
+        _, summary = follow(filter, lifts(), seen)
+        found.append(identify(filter, summary.belief, summary.b, on_pass=lambda _: None))
     return found
 
 
@@ -73,8 +73,8 @@ def test_standard_errors_say_something(runs):
 
 @pytest.mark.slow
 def test_the_attachments_are_found_with_the_right_sheet(runs):
-    for _, _, stated, _ in runs:
-        found = np.asarray(stated.probability) > 0.5
+    for _, _, summary, _ in runs:
+        found = np.asarray(summary.probability) > 0.5
         assert (found == attached()).mean() > 0.95
 
 
@@ -82,8 +82,8 @@ def test_the_attachments_are_found_with_the_right_sheet(runs):
 def test_frames_at_rest_say_nothing():
     """The first of each lift, where nothing has moved yet."""
     filter, frames = ImplicitFilter(sheet_balance(1e-4)), lifts()[::4]
-    _, stated = follow(filter, frames, [observed(frame, i) for i, frame in enumerate(frames)])
-    factors, log_sd, _, converged = identify(filter, stated.belief, stated.b, on_pass=lambda _: None)
+    _, summary = follow(filter, frames, [observed(frame, i) for i, frame in enumerate(frames)])
+    factors, log_sd, _, converged = identify(filter, summary.belief, summary.b, on_pass=lambda _: None)
     found = material(DECLARATION, factors, log_sd, converged=converged)
     assert set(found.refused) == {"weight", "bending", "membrane stiffness"}
     assert found.declaration == DECLARATION

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 from jiggle_mj.eval.runs.experiment import run_scene
-from jiggle_mj.eval.studies.main_table import MAIN, Row
+from jiggle_mj.eval.studies.main_table import MAIN, MainRow
 from jiggle_mj.scenes import load_scene
 
 
 @pytest.mark.slow
 @pytest.mark.render
 @pytest.mark.parametrize("row", MAIN, ids=lambda row: f"{row.scene}-{row.sensing}")
-def test_each_row_of_the_readmes_table_keeps_its_bars(row: Row, tmp_path: Path):
+def test_each_row_of_the_readmes_table_keeps_its_bars(row: MainRow, tmp_path: Path):
     """PCD, PUG >= 0.95 in a ring; tracking RMS <= 0.6 mm; nothing reported where nothing is attached. Of b* = k / 30
     exactly >= 0.95 from particles and >= 0.75 from images, with NEES per degree of freedom in [0.4, 3]. What pulls with
     less than the noise of particles allows to be told is not asked for."""
@@ -25,7 +25,7 @@ def test_each_row_of_the_readmes_table_keeps_its_bars(row: Row, tmp_path: Path):
         return
     exact, ring = (figures["detection"]["by_dilation"][rings] for rings in "01")
     assert ring["pcd"] >= 0.95
-    if row != Row(scene="arc_soft", sensing="particles"):
+    if row != MainRow(scene="arc_soft", sensing="particles"):
         assert ring["pug"] >= 0.95
     if row.scene not in ("arc_soft", "arc_stiff", "arc_weld"):
         assert min(exact["pcd"], exact["pug"]) >= (0.95 if row.sensing == "particles" else 0.75)

@@ -9,10 +9,10 @@ import pytest
 
 from jiggle_mj.scenes import disturbed
 from jiggle_mj.scenes.load_tests import floating, load_tests, stiffness, typed, upward_stiffness
-from jiggle_mj.scenes.scene.scene import Declared, Scene, Tissue
+from jiggle_mj.scenes.scene.scene import DeclaredConfig, Scene, TissueConfig
 from tests.support.tiny_scene import call, scene_file
 
-COARSE = Scene(name="sheet", tissue=Tissue(size=(0.1, 0.1), spacing=9e-3))
+COARSE = Scene(name="sheet", tissue=TissueConfig(size=(0.1, 0.1), spacing=9e-3))
 
 
 def on(mesh: str, spacing: float) -> Scene:
@@ -44,7 +44,7 @@ def test_a_cantilever_droops_as_a_beam_does():
 
 def droop_over_beam(spacing: float) -> float:
     """Of the end of a strip that is held up to x = -0.02 and bears a unit pressure."""
-    tissue = Tissue(size=(0.12, 0.08), spacing=spacing, mesh="equilateral", poisson=0.0)
+    tissue = TissueConfig(size=(0.12, 0.08), spacing=spacing, mesh="equilateral", poisson=0.0)
     simulation = floating(Scene(name="beam", tissue=tissue))
     sheet = simulation.tissue.sheet
     x = sheet.vertices[:, 0]
@@ -77,7 +77,7 @@ def test_a_stiff_spot_makes_the_sheet_stiffer_but_not_as_stiff_as_itself():
 
 
 def test_a_mesh_that_would_be_too_coarse_is_left_out():
-    rough = Scene(name="rough", tissue=Tissue(size=(0.06, 0.06), spacing=0.012))
+    rough = Scene(name="rough", tissue=TissueConfig(size=(0.06, 0.06), spacing=0.012))
     assert [one.spacing for one in load_tests(rough)] == pytest.approx([0.012, 0.009])
 
 
@@ -90,7 +90,7 @@ def test_the_verb_says_where_the_declared_material_is_not_the_sheets(tmp_path, m
     printed = capsys.readouterr()
     said = json.loads(printed.out)
     assert [one["spacing"] for one in said["effective"]] == pytest.approx([10.5e-3, 7e-3, 5.25e-3])
-    assert said["effective"][1]["stretch_x"] == pytest.approx(2 * Declared().membrane_stiffness, rel=1e-3)
-    assert said["typed"]["stretch_x"] == pytest.approx(Declared().membrane_stiffness)
+    assert said["effective"][1]["stretch_x"] == pytest.approx(2 * DeclaredConfig().membrane_stiffness, rel=1e-3)
+    assert said["typed"]["stretch_x"] == pytest.approx(DeclaredConfig().membrane_stiffness)
     assert "stretch x is 2 times what [declared] says" in printed.err
     assert "shear is 2 times" in printed.err and "poisson is" not in printed.err

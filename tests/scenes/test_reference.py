@@ -14,18 +14,18 @@ from jiggle_mj.errors import ActionError, SceneError, SimulationError
 from jiggle_mj.observation import Grasp, Move, Release, Wait
 from jiggle_mj.scenes import Reference, Scene, programme
 from jiggle_mj.scenes.scene.attachments import Disc
-from jiggle_mj.scenes.scene.scene import Bed, Programme, Tissue, Tweezer
+from jiggle_mj.scenes.scene.scene import BedConfig, ProgrammeConfig, TissueConfig, TweezerConfig
 from jiggle_mj.scenes.tissue import simulation
 
-TISSUE = Tissue(size=(0.06, 0.06), spacing=6e-3)
+TISSUE = TissueConfig(size=(0.06, 0.06), spacing=6e-3)
 MIDDLE = Disc(centre=(0.0, 0.0), radius=0.012, stiffness=1.0)
 CORNER = np.array([-0.027, -0.027, 4e-4])
 SCENE = Scene(
     name="small",
     tissue=TISSUE,
     attachments=(MIDDLE,),
-    tweezer=Tweezer(radius=8e-3),
-    programme=Programme(still_frames=2, height=0.02, increments=2),
+    tweezer=TweezerConfig(radius=8e-3),
+    programme=ProgrammeConfig(still_frames=2, height=0.02, increments=2),
 )
 
 
@@ -48,7 +48,7 @@ def test_a_hanging_sheet_stretches_its_springs_by_its_weight():
     """Without a bed every vertex hangs on k: sum of k * dz = m g, for three decades of k."""
     for k in (0.5, 5.0, 50.0):
         everywhere = Disc(centre=(0.0, 0.0), radius=0.1, stiffness=k)
-        scene = dataclasses.replace(SCENE, bed=Bed(present=False), attachments=(everywhere,))
+        scene = dataclasses.replace(SCENE, bed=BedConfig(present=False), attachments=(everywhere,))
         reference = particles(scene)
         for _ in range(10):
             reference.step(Wait())
@@ -72,9 +72,9 @@ def test_a_strip_pulled_at_both_ends_has_the_typed_modulus():
     Measured 30.61 N/m against 30.60 at e = 1.3 %; 2 % is left for the ends, which cannot narrow.
     """
     length, width = 0.12, 0.03
-    tissue = Tissue(size=(length, width), spacing=6e-3)
+    tissue = TissueConfig(size=(length, width), spacing=6e-3)
     ends = tuple(Disc(centre=(x, 0.0), radius=0.02, stiffness=math.inf) for x in (-length / 2, length / 2))
-    reference = particles(dataclasses.replace(SCENE, tissue=tissue, attachments=ends, bed=Bed(friction=0.0)))
+    reference = particles(dataclasses.replace(SCENE, tissue=tissue, attachments=ends, bed=BedConfig(friction=0.0)))
     model, data = reference._simulation.tissue.model, reference._simulation.data
     rest = reference._simulation.tissue.sheet.vertices
     right = np.flatnonzero(np.isinf(reference._simulation.tissue.stiffness) & (rest[:, 0] > 0))

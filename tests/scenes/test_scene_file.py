@@ -11,7 +11,7 @@ from jiggle_mj.errors import SceneError
 from jiggle_mj.scenes import Scene, load_scene, scene_table, shipped_scenes
 from jiggle_mj.scenes.scene.attachments import owners
 from jiggle_mj.scenes.scene.programme import grasp_points
-from jiggle_mj.scenes.scene.scene import Tissue
+from jiggle_mj.scenes.scene.scene import TissueConfig
 from jiggle_mj.scenes.scene_file import scene_from_table
 from jiggle_mj.scenes.tissue.mesh import build_sheet
 
@@ -169,7 +169,7 @@ def test_a_wrong_scene_is_refused_with_key_value_and_what_is_allowed(case):
 
 def test_a_scene_built_in_python_is_checked_like_a_file():
     with pytest.raises(SceneError, match=r"tissue\.poisson = 0\.5: must be a number in \[0, 0\.5\)"):
-        Tissue(poisson=0.5)
+        TissueConfig(poisson=0.5)
 
 
 def test_an_unknown_name_lists_the_shipped_scenes():

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from jiggle_mj.observation import UNTURNED, Declaration, MeasuredPoints, Observation, ToolReport, ToolState
-from jiggle_mj.scenes.scene.scene import Bed, Scene, Tissue
+from jiggle_mj.scenes.scene.scene import BedConfig, Scene, TissueConfig
 from jiggle_mj.scenes.tissue.jaws import Jaws
 from jiggle_mj.scenes.tissue.model import build_tissue
 
@@ -26,8 +26,8 @@ class HangingSheet:
     def __init__(self) -> None:
         scene = Scene(
             name="hanging",
-            tissue=Tissue(size=(0.1, 0.12), spacing=0.011, mesh="equilateral"),
-            bed=Bed(present=False),
+            tissue=TissueConfig(size=(0.1, 0.12), spacing=0.011, mesh="equilateral"),
+            bed=BedConfig(present=False),
         )
         tissue = build_tissue(scene, drawn=False)
         self.model, self.data = tissue.model, mujoco.MjData(tissue.model)

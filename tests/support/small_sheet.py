@@ -9,8 +9,8 @@ import numpy as np
 
 from jiggle_mj.estimate import Belief
 from jiggle_mj.estimator.belief.attachment_belief import AttachmentBelief
-from jiggle_mj.estimator.effects.sheet_model import Moment, SheetModel, centred, undisturbed
-from jiggle_mj.estimator.filters.evidence import Evidence, Stated, Update
+from jiggle_mj.estimator.effects.sheet_model import FrameContext, SheetModel, centred, nominal_energy
+from jiggle_mj.estimator.filters.evidence import Evidence, PosteriorSummary, Update
 from jiggle_mj.estimator.filters.force_balance import LEAST, ForceBalance
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
 from jiggle_mj.estimator.physics.block_tridiagonal import BlockTridiagonal, Layout
@@ -115,11 +115,13 @@ def at_rest(
     at: float = 0.0,
     times: np.ndarray = STOOD[0],
     ways: np.ndarray = STOOD[1],
-) -> tuple[SheetModel, Moment]:
+) -> tuple[SheetModel, FrameContext]:
     """A sheet's model without effects, and a moment when it lies as ever, whatever the tool says."""
     x = jnp.asarray(mesh.rest)
-    model = SheetModel(energy=undisturbed(mesh, declared), tool=jnp.zeros(3), view=centred(mesh), time=jnp.asarray(at))
-    moment = Moment(
+    model = SheetModel(
+        energy=nominal_energy(mesh, declared), tool=jnp.zeros(3), view=centred(mesh), time=jnp.asarray(at)
+    )
+    moment = FrameContext(
         rest=x,
         time=jnp.asarray(at),
         gap=jnp.asarray(0.1),
@@ -175,27 +177,27 @@ def lifts(stiffness: float = STIFFNESS) -> tuple[Lift, ...]:
     return tuple(frames)
 
 
-def follow(filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence]) -> tuple[Update, Stated]:
+def follow(filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence]) -> tuple[Update, PosteriorSummary]:
     """All frames, the jaws opening after each lift; the last update, and what is stated at the end."""
     belief, b, grasp, update = sheet_prior(), jnp.zeros(sheet().n), 1, None
     for frame, one in zip(frames, seen, strict=True):
         if frame.grasp != grasp:
-            stated = filter.release(belief)
-            assert stated is not None
-            belief, b, grasp = stated.belief, stated.b, frame.grasp
+            summary = filter.release(belief)
+            assert summary is not None
+            belief, b, grasp = summary.belief, summary.b, frame.grasp
         update = filter.update(belief, b, one, one.y)
         belief, b = update.belief, update.b
-    stated = filter.release(belief)
-    assert update is not None and stated is not None
-    return update, stated
+    summary = filter.release(belief)
+    assert update is not None and summary is not None
+    return update, summary
 
 
 def nees(belief: AttachmentBelief) -> float:
     """Squared error of the attached particles' s in units of their stated covariance, per degree of freedom, where
     attached means `STIFFNESS`; free ones are exactly where the prior has its peak, and would be none."""
     mean, covariance = (np.asarray(part) for part in belief.moments())
-    stated = Belief(mean=mean, covariance=covariance, reference=float(belief.reference))
-    found = nees_per_dof(stated, STIFFNESS * attached(), among=attached())
+    summary = Belief(mean=mean, covariance=covariance, reference=float(belief.reference))
+    found = nees_per_dof(summary, STIFFNESS * attached(), among=attached())
     assert found is not None
     return found
 
@@ -216,4 +218,4 @@ def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Eviden
     if unseen is not None:
         precision = np.where(unseen[:, None, None], 0.0, precision)
     held = jnp.asarray(frame.held)
-    return Evidence(y=jnp.asarray(noisy), precision=jnp.asarray(precision), held=held, loaded=held)
+    return Evidence(y=jnp.asarray(noisy), precision=jnp.asarray(precision), held=held, force_unknown=held)

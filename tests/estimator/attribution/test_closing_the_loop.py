@@ -14,20 +14,20 @@ import pytest
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.attribution import fit as fitting
-from jiggle_mj.estimator.attribution import leftover as leaving
 from jiggle_mj.estimator.attribution import sheet as predicting
+from jiggle_mj.estimator.attribution import unexplained_residual as leaving
 from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
 from jiggle_mj.estimator.attribution.closing import close_the_loop
+from jiggle_mj.estimator.attribution.dataset import assumed, collect_dataset
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
 from jiggle_mj.estimator.attribution.fit import doubted, fit, moved
-from jiggle_mj.estimator.attribution.gather import assumed, gather
-from jiggle_mj.estimator.attribution.linear import Glance
+from jiggle_mj.estimator.attribution.hypotheses import jackknife_sd
+from jiggle_mj.estimator.attribution.linear import NormalEquations
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.scores import bayes_factor, occam
 from jiggle_mj.estimator.attribution.sheet import closed_on, held_way, predict_all
 from jiggle_mj.estimator.attribution.still_noise import MODES, STEP, StillNoise, measure
 from jiggle_mj.estimator.attribution.suggestion import suggest, told_apart
-from jiggle_mj.estimator.attribution.trials import jackknife_sd
 from jiggle_mj.estimator.attribution.users_effects import check_effects
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
@@ -69,7 +69,7 @@ def lifted(gravity: float) -> tuple[np.ndarray, ...]:
         start = sheet().rest if before is None or before.grasp != lift.grasp else states[-1]
         held, to = jnp.asarray(lift.held), sheet().rest + lift.tip - first[lift.grasp]
         precision = jnp.broadcast_to(1e6 * jnp.eye(3)[None], (len(s), 3, 3))
-        evidence = Evidence(y=jnp.asarray(to), precision=precision, held=held, loaded=held)
+        evidence = Evidence(y=jnp.asarray(to), precision=precision, held=held, force_unknown=held)
         states.append(np.asarray(predict(jnp.asarray(np.where(lift.held[:, None], to, start)), s, evidence)))
     return tuple(states)
 
@@ -101,10 +101,10 @@ def seen(gravity: float, *, tool_scale: float = 1.0) -> list[Observation]:
 
 
 def closed_over(observations: list[Observation]):
-    gathered = gather(DECLARATION, None, observations)
+    dataset = collect_dataset(DECLARATION, None, observations)
     with jax.enable_x64(True), one_thread():
-        closed = close_the_loop(gathered, library=SMALL)
-        return closed, discrepancy(closed, gathered), gathered
+        closed = close_the_loop(dataset, library=SMALL)
+        return closed, discrepancy(closed, dataset), dataset
 
 
 @pytest.fixture(scope="module")
@@ -118,8 +118,8 @@ def test_an_undeclared_gravity_is_named_with_what_positions_cannot_tell_it_from(
     closed, found, _ = light
     assert {found["effects"][0]["name"], *found["ambiguous_with"]} == {"gravity", "stretch"}, story(found)
     assert found["verdict"] == "ambiguous"
-    trials = [*closed.accepted, *closed.rivals[0]]
-    gravity = next(one for one in trials if one.effect.name == "gravity")
+    hypotheses = [*closed.accepted, *closed.rivals[0]]
+    gravity = next(one for one in hypotheses if one.effect.name == "gravity")
     assert gravity.theta[2] == pytest.approx(0.8, abs=0.05)
     assert closed.reported is not None
     before, after = (one.rms for one in closed.reported)
@@ -128,9 +128,9 @@ def test_an_undeclared_gravity_is_named_with_what_positions_cannot_tell_it_from(
 
 
 def test_a_fit_finds_the_same_size_from_nothing_and_from_the_truth(light):
-    closed, _, gathered = light
+    closed, _, dataset = light
     problem, before = closed.problem, closed.stages[0].fitted
-    at, parts = problem.sheet.place("gravity"), {one.part for one in gathered.frames}
+    at, parts = problem.sheet.place("gravity"), {one.part for one in dataset.frames}
     with jax.enable_x64(True), one_thread():
         begun = [moved(problem, before, at, np.array([0.0, 0.0, size])) for size in (0.0, 0.8)]
         nothing, truth = (fit(problem, at, point, parts) for point in begun)
@@ -141,7 +141,7 @@ def test_a_fit_ends_where_its_parameters_fit_best(light):
     """To half a standard deviation, where all is weighed anew."""
     problem, ended = light[0].problem, light[0].stages[-1].fitted
     with jax.enable_x64(True), one_thread():
-        anew = fitting._reckoned(problem, ended.named, ended.point, list(ended.glances))
+        anew = fitting._linearise_at(problem, ended.named, ended.point, list(ended.equations))
         left, _ = fitting._at_hand(problem, anew)
         sd = occam(problem, ended)[1]
     np.testing.assert_allclose(left[ended.named] / sd, 0, atol=0.5)
@@ -178,7 +178,9 @@ def test_normal_equations_are_carried_to_another_point():
     rng = np.random.default_rng(0)
     columns, tool, gone = rng.normal(size=(9, 6)), rng.normal(size=(3, 4)), np.append(rng.normal(size=5), 1.0)
     with jax.enable_x64(True):
-        found = fitting._carried(Glance(square=jnp.asarray(columns.T @ columns), tool=jnp.asarray(tool)), gone)
+        found = fitting._transferred(
+            NormalEquations(square=jnp.asarray(columns.T @ columns), tool=jnp.asarray(tool)), gone
+        )
     there = np.c_[columns[:, :-1], columns @ gone]
     np.testing.assert_allclose(found.square, there.T @ there, atol=1e-12)
     np.testing.assert_allclose(found.tool, np.c_[tool[:, :-1], tool @ gone[2:]], atol=1e-12)
@@ -204,7 +206,7 @@ def test_errors_no_larger_than_the_usual_gain_nothing_wherever_a_last_step_went(
         stepped = dataclasses.replace(fitted, point=moved(problem, fitted, at, fitted.point.theta[at] - 0.2))
         for variances in ((1.0,), (1.0, 1.0 + 1e-9)):
             monkeypatch.setattr(leaving, "VARIANCES", variances)
-            gains.append(leaving.leftover(problem, stepped).gain)
+            gains.append(leaving.unexplained_residual(problem, stepped).gain)
     assert gains[1] == pytest.approx(gains[0], abs=1e-3)
 
 
@@ -213,7 +215,7 @@ def test_smaller_errors_than_the_usual_leave_nothing_over(light, monkeypatch):
     problem, fitted = light[0].problem, light[0].stages[-1].fitted
     monkeypatch.setattr(leaving, "VARIANCES", (1.0,))
     with jax.enable_x64(True), one_thread():
-        found = leaving.leftover(problem.widened(1.0, 16 * problem.amplitude), fitted)
+        found = leaving.unexplained_residual(problem.widened(1.0, 16 * problem.amplitude), fitted)
     assert found.amplitude < 1
     assert found.gain == pytest.approx(leaving._of_tool(problem, fitted)[1])
 
@@ -223,7 +225,7 @@ def test_frames_that_are_doubted_say_less_of_the_attachments(light):
     closed, *_ = light
     last = closed.stages[-1].fitted
     with jax.enable_x64(True), one_thread():
-        fitted = fitting._reckoned(closed.problem, last.named, last.point, list(last.glances))
+        fitted = fitting._linearise_at(closed.problem, last.named, last.point, list(last.equations))
         same, nothing = (doubted(closed.problem, fitted, excess) for excess in (1.0, 1e9))
     np.testing.assert_array_equal(same.probability, fitted.probability)
     assert fitted.attached.any() and not nothing.attached.any()
@@ -258,7 +260,7 @@ def test_grasps_are_predicted_side_by_side_and_the_frames_of_each_in_turn(light)
 def test_what_creeps_is_predicted_until_it_stays(monkeypatch):
     """Anchors that follow what they hold, in the frame itself too: from rest, as from what was predicted so."""
     creep = tuple(effect for effect in LIBRARY if effect.name == "anchor_creep")
-    problem = Problem.build(gather(DECLARATION, None, seen(1.0)), creep)
+    problem = Problem.build(collect_dataset(DECLARATION, None, seen(1.0)), creep)
     theta, s = np.zeros(problem.sheet.size), 0.3 * attached()
     theta[problem.sheet.place("anchor_creep")] = 3.0
     rest = np.array([sheet().rest for _ in problem.history.frames])
@@ -330,14 +332,14 @@ def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
 
 
 def test_what_was_found_is_kept_before_a_pull_is_looked_for(light, tmp_path, monkeypatch):
-    closed, _, gathered = light
+    closed, _, dataset = light
     recording = SimpleNamespace(declaration=None, camera=None, metadata={"name": "light"})
 
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(keeping.Recording, "open", staticmethod(lambda *_, **__: recording))
-    monkeypatch.setattr(keeping, "gather", lambda *_, **__: gathered)
+    monkeypatch.setattr(keeping, "gather", lambda *_, **__: dataset)
     monkeypatch.setattr(keeping, "close_the_loop", lambda *_, **__: closed)
     monkeypatch.setattr(keeping, "suggest", stopped)
     with pytest.raises(KeyboardInterrupt):
@@ -349,17 +351,17 @@ def test_what_was_found_is_kept_before_a_pull_is_looked_for(light, tmp_path, mon
 
 @pytest.mark.slow
 def test_a_pull_is_suggested_that_tells_more_than_the_first_lift_did(light):
-    closed, gathered = light[0], light[2]
+    closed, dataset = light[0], light[2]
     with jax.enable_x64(True), one_thread():
-        found = suggest(closed, gathered)
+        found = suggest(closed, dataset)
         assert found is not None and set(found.between) == {"gravity", "stretch"}
         fits = [one.fitted for one in (closed.accepted[0], *closed.rivals[0])]
-        first = [one for one in gathered.frames if one.grasp == 1][:4]
+        first = [one for one in dataset.frames if one.grasp == 1][:4]
         assert found.expected > told_apart(closed.problem, fits, first) > 0
         assert told_apart(closed.problem, [fits[0], fits[0]], first) == pytest.approx(0, abs=1)
-    assert np.linalg.norm(found.pull) <= max(np.linalg.norm(one.frame.way) for one in gathered.frames) + 1e-9
+    assert np.linalg.norm(found.pull) <= max(np.linalg.norm(one.frame.way) for one in dataset.frames) + 1e-9
     assert np.min(np.linalg.norm(sheet().rest - found.grasp, axis=1)) < 1e-3
-    told = discrepancy(closed, gathered) | {"suggestion": suggested(found)}
+    told = discrepancy(closed, dataset) | {"suggestion": suggested(found)}
     assert ("To tell" in " ".join(story(told))) == found.enough
 
 
@@ -470,9 +472,9 @@ def test_where_the_jaws_closed_is_seen_by_the_moved_camera_too(light):
         k, shift = 2, jnp.array([1e-3, -2e-3, 3e-3, 0.0, 0.0, 0.0])
         states = light[0].stages[0].fitted.point.states
         frame, moment = problem.history.frames[k].frame, problem.history.moment(k, states)
-        moved = dataclasses.replace(frame, y=frame.y + shift[None, :3], turned=frame.turned + shift[None, :3])
+        moved = dataclasses.replace(frame, y=frame.y + shift[None, :3], rotated=frame.rotated + shift[None, :3])
         closed = closed_on(sheet, shift, moved, moment)
-        np.testing.assert_allclose(closed, frame.turned, atol=1e-12)
+        np.testing.assert_allclose(closed, frame.rotated, atol=1e-12)
         x, nothing = jnp.asarray(states[k]), jnp.zeros(6)
         ways = [
             held_way(sheet.model(theta, moment, one.way), one, closed_on(sheet, theta, one, moment), x)
@@ -486,8 +488,8 @@ def test_without_still_frames_the_noise_is_assumed_and_said_to_be():
     observations = [one for one in seen(1.0) if one.tool.closed][:6]
     rest = dataclasses.replace(observations[0], tool=dataclasses.replace(observations[0].tool, closed=False, grasp=0))
     rest = dataclasses.replace(rest, points=seen(1.0)[0].points)
-    gathered = gather(DECLARATION, None, [rest, *observations])
-    assert gathered.noise == assumed(NOISE)
+    dataset = collect_dataset(DECLARATION, None, [rest, *observations])
+    assert dataset.noise == assumed(NOISE)
 
 
 def test_time_runs_from_when_the_sheet_lay_as_its_rest_shape_has_it():
@@ -499,7 +501,7 @@ def test_time_runs_from_when_the_sheet_lay_as_its_rest_shape_has_it():
     assert estimator.rest_time == np.mean([one.time for one in lying])
     began = dataclasses.replace(first, index=STILL - 1, time=first.time - 10**9, points=lying[0].points)
     mesh = DeclaredMesh(vertices=sheet().rest, faces=sheet().faces, track_id=lying[0].points.track_id)
-    frames = gather(dataclasses.replace(DECLARATION, mesh=mesh), None, [began, first, second]).frames
+    frames = collect_dataset(dataclasses.replace(DECLARATION, mesh=mesh), None, [began, first, second]).frames
     np.testing.assert_allclose([one.time for one in frames][-2:], [1.0, 1.25])
 
 

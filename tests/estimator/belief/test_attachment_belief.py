@@ -14,8 +14,8 @@ from jiggle_mj.estimator.belief.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.belief.spike_and_slab import SpikeAndSlab
 
-RUNGS, SPREAD = (0.03, 0.3), 0.5
-STIFFNESS = SpikeAndSlab.build(spike=3e-3, rungs=RUNGS, spread=SPREAD, even=1e12, partial=0.0)
+COMPONENTS, SPREAD = (0.03, 0.3), 0.5
+STIFFNESS = SpikeAndSlab.build(spike=3e-3, components=COMPONENTS, spread=SPREAD, dirichlet_strength=1e12, partial=0.0)
 """So sure of its shares that nothing is learned."""
 PROBABILITY, REFERENCE = 0.1, 30.0
 
@@ -73,7 +73,10 @@ def test_two_particles_that_share_a_load():
     precision = np.full((2, 2), 1 / variance) + faint * np.eye(2)
     belief = swept(chain(2, coupling=0.0).add(jnp.asarray(precision), jnp.asarray(np.full(2, total / variance))), 60)
     s = np.concatenate([np.linspace(0, 0.02, 400, endpoint=False), np.linspace(0.02, 1, 2400)])
-    parts = [np.exp(-0.5 * ((s - at) / sd) ** 2) for at, sd in ((0, 3e-3), *((rung, SPREAD * rung) for rung in RUNGS))]
+    parts = [
+        np.exp(-0.5 * ((s - at) / sd) ** 2)
+        for at, sd in ((0, 3e-3), *((component, SPREAD * component) for component in COMPONENTS))
+    ]
     free, soft, stiff = (part / np.trapezoid(part, s) for part in parts)
     prior = (1 - PROBABILITY) * free + PROBABILITY * (soft + stiff) / 2
     joint = np.exp(-0.5 * (s[:, None] + s[None] - total) ** 2 / variance) * prior[:, None] * prior[None]
@@ -114,12 +117,12 @@ def test_what_the_mesh_moves_widens_each_and_leaves_sums_alone(monkeypatch):
     """A third of what is between two neighbours, of which one is attached: as much at the free one, none of the sum."""
     mean, variance = np.array([0.0, 0.1, 0.0]), np.full(3, 1e-6)
     belief = chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance))
-    stated = []
+    summary = []
     for moved in (0.0, 1 / 3):
         monkeypatch.setattr(attachment_belief, "MOVED", moved)
         jax.clear_caches()
-        stated.append((np.asarray(moments(belief)[1]), posterior(belief).sd, interval(belief)))
-    (sharp, sharp_sd, sharp_interval), (wide, wide_sd, wide_interval) = stated
+        summary.append((np.asarray(moments(belief)[1]), posterior(belief).sd, interval(belief)))
+    (sharp, sharp_sd, sharp_interval), (wide, wide_sd, wide_interval) = summary
     s = np.asarray(moments(belief)[0])
     first, second = ((s[i] + s[i + 1]) / 2 * (1 - (s[i] + s[i + 1]) / 2) / 3 for i in (0, 1))
     edges = np.array([[1, -1, 0], [0, 1, -1]]) * np.array([[first], [second]])

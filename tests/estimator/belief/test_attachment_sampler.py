@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from jiggle_mj.estimator.belief.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief.attachment_prior import AttachmentPrior
-from jiggle_mj.estimator.belief.attachment_sampler import Sampled, Sampler
+from jiggle_mj.estimator.belief.attachment_sampler import PosteriorSamples, Sampler
 from jiggle_mj.estimator.belief.spike_and_slab import SpikeAndSlab
 
 N, PROBABILITY, COUPLING = 5, 0.1, 1.0
@@ -20,9 +20,11 @@ EDGES = np.column_stack([np.arange(N - 1), np.arange(1, N)])
 ROUNDS = 3000
 
 
-def prior(even: float = 1e12) -> AttachmentPrior:
+def prior(dirichlet_strength: float = 1e12) -> AttachmentPrior:
     """A row of particles; by default so sure of its shares that nothing is learned."""
-    stiffness = SpikeAndSlab.build(spike=3e-3, rungs=(0.03, 0.3), spread=0.3, even=even, partial=0.0)
+    stiffness = SpikeAndSlab.build(
+        spike=3e-3, components=(0.03, 0.3), spread=0.3, dirichlet_strength=dirichlet_strength, partial=0.0
+    )
     return AttachmentPrior.build(N, EDGES, stiffness=stiffness, probability=PROBABILITY, coupling=COUPLING)
 
 
@@ -33,13 +35,15 @@ def seen(load: float) -> tuple[np.ndarray, np.ndarray]:
     return precision, np.array([1e4 * load, 1e4 * load, 0.0, 30.0, 0.0])
 
 
-def sampler(load: float, even: float = 1e12) -> Sampler:
+def sampler(load: float, dirichlet_strength: float = 1e12) -> Sampler:
     precision, shift = seen(load)
-    return Sampler(prior=prior(even), precision=jnp.asarray(precision), shift=jnp.asarray(shift))
+    return Sampler(prior=prior(dirichlet_strength), precision=jnp.asarray(precision), shift=jnp.asarray(shift))
 
 
-def sampled(load: float, rounds: int = ROUNDS, doublings: int = 1, even: float = 1e12) -> Sampled:
-    return eqx.filter_jit(sampler(load, even).run)(
+def sampled(
+    load: float, rounds: int = ROUNDS, doublings: int = 1, dirichlet_strength: float = 1e12
+) -> PosteriorSamples:
+    return eqx.filter_jit(sampler(load, dirichlet_strength).run)(
         jnp.zeros(N, int),
         jax.random.key(1),
         burn_in=2,
@@ -116,9 +120,9 @@ def test_a_sweep_keeps_the_moments_up_to_date():
 
 def test_shares_are_learned_from_those_that_are_attached():
     """Two stiff ones; with few expected beforehand the stiff rung is the commoner."""
-    found = sampled(0.6, even=1.0)
-    assert float(found.whole[1]) > 0.7
-    assert float(jnp.sum(found.whole)) == pytest.approx(1)
+    found = sampled(0.6, dirichlet_strength=1.0)
+    assert float(found.weights[1]) > 0.7
+    assert float(jnp.sum(found.weights)) == pytest.approx(1)
 
 
 def test_what_asks_for_less_than_nothing_is_free():

@@ -9,9 +9,9 @@ from scipy.stats import norm
 
 from jiggle_mj.estimator.belief.spike_and_slab import LEARNED, Mixture, SpikeAndSlab
 
-SPIKE, RUNGS, SPREAD = 3e-3, (0.01, 0.1, 1.0), 0.5
+SPIKE, COMPONENTS, SPREAD = 3e-3, (0.01, 0.1, 1.0), 0.5
 LOG_ODDS = -3.0
-PRIOR = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=3.0, partial=0.0)
+PRIOR = SpikeAndSlab.build(spike=SPIKE, components=COMPONENTS, spread=SPREAD, dirichlet_strength=3.0, partial=0.0)
 
 posterior = eqx.filter_jit(SpikeAndSlab.posterior)
 learned_from = eqx.filter_jit(SpikeAndSlab.learned)
@@ -29,10 +29,10 @@ def density(mean: float, variance: float) -> tuple[np.ndarray, np.ndarray, float
         return shape / np.trapezoid(shape, s)
 
     free = cut_off(0, SPIKE) * seen
-    attached = np.mean([cut_off(rung, SPREAD * rung) for rung in RUNGS], axis=0) * seen
+    attached = np.mean([cut_off(component, SPREAD * component) for component in COMPONENTS], axis=0) * seen
     odds = np.trapezoid(attached, s) / np.trapezoid(free, s)
-    whole = free + np.exp(LOG_ODDS) * attached
-    return s, whole / np.trapezoid(whole, s), float(np.log(odds))
+    weights = free + np.exp(LOG_ODDS) * attached
+    return s, weights / np.trapezoid(weights, s), float(np.log(odds))
 
 
 @pytest.mark.parametrize(
@@ -83,30 +83,34 @@ def test_the_shares_are_those_of_the_particles_called_attached():
 
 def test_a_part_of_an_attachment_is_on_the_nearest_softer_rung():
     """A million parts, as likely as one another, of the b = s / (1 - s) of each rung."""
-    rungs = np.array([0.01, 0.1, 0.5, 0.95])
-    prior = SpikeAndSlab.build(spike=SPIKE, rungs=tuple(rungs), spread=SPREAD, even=3.0, partial=1.0)
+    components = np.array([0.01, 0.1, 0.5, 0.95])
+    prior = SpikeAndSlab.build(
+        spike=SPIKE, components=tuple(components), spread=SPREAD, dirichlet_strength=3.0, partial=1.0
+    )
     parts = np.linspace(0, 1, 1_000_001)[1:]
-    logs = np.log(rungs / (1 - rungs))
+    logs = np.log(components / (1 - components))
     for column, log in enumerate(logs):
         nearest = np.argmin(np.abs(np.log(parts)[:, None] + log - logs), axis=1)
-        np.testing.assert_allclose(prior.parting[:, column], np.bincount(nearest, minlength=4) / 1e6, atol=1e-5)
+        np.testing.assert_allclose(prior.border_kernel[:, column], np.bincount(nearest, minlength=4) / 1e6, atol=1e-5)
 
 
 def test_the_shares_before_parting_are_learned_through_it():
     """Particles as whole attachments on the third rung and a half of parts of such leave: what EM settles on, and what
     draws are spread around."""
-    prior = SpikeAndSlab.build(spike=SPIKE, rungs=(0.01, 0.03, 0.1, 0.3), spread=0.1, even=1.0, partial=0.5)
-    count = np.rint(2000 * np.asarray(prior.parting[:, 2])).astype(int)
+    prior = SpikeAndSlab.build(
+        spike=SPIKE, components=(0.01, 0.03, 0.1, 0.3), spread=0.1, dirichlet_strength=1.0, partial=0.5
+    )
+    count = np.rint(2000 * np.asarray(prior.border_kernel[:, 2])).astype(int)
     state = np.append(np.zeros(50, int), np.repeat(np.arange(4), count) + 1)
     s = jnp.asarray(np.append(0.0, [0.01, 0.03, 0.1, 0.3])[state])
     mixture, factor = posterior(prior, s, jnp.full(len(s), 1e-9), jnp.full(len(s), LOG_ODDS))
     learned = prior
     for _ in range(200):
         learned = learned_from(learned, mixture, factor)
-    assert float(learned.whole[2]) > 0.98
-    np.testing.assert_allclose(learned.share, prior.parting[:, 2], atol=0.02)
+    assert float(learned.weights[2]) > 0.98
+    np.testing.assert_allclose(learned.share, prior.border_kernel[:, 2], atol=0.02)
     drawn, kept = prior, []
     for k in range(300):
         drawn = drawn_for(drawn, jnp.asarray(state), jax.random.key(k))
-        kept.append(np.asarray(drawn.whole))
-    np.testing.assert_allclose(np.mean(kept[100:], axis=0), learned.whole, atol=0.02)
+        kept.append(np.asarray(drawn.weights))
+    np.testing.assert_allclose(np.mean(kept[100:], axis=0), learned.weights, atol=0.02)

@@ -14,7 +14,7 @@ from jiggle_mj.estimator.belief.attachment_belief import SITE_PRECISION, Attachm
 from jiggle_mj.estimator.belief.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.belief.spike_and_slab import SpikeAndSlab
 from jiggle_mj.estimator.belief.topology import FAILS, Change, after, region_of
-from jiggle_mj.estimator.filters.implicit import EVEN, PARTIAL, RUNGS, SPIKE, SPREAD
+from jiggle_mj.estimator.filters.implicit import COMPONENTS, DIRICHLET_STRENGTH, PARTIAL, SPIKE, SPREAD
 from jiggle_mj.observation import Cut, Declaration, MeasuredPoints, Observation, Suture, ToolState
 
 N, REFERENCE = 12, 30.0
@@ -25,7 +25,9 @@ CUT = Cut(path=np.zeros((1, 2)), width=1e-2)
 @pytest.fixture(scope="module")
 def belief() -> AttachmentBelief:
     """A chain, half of it attached with s = 0.03, seen with correlated noise of 0.004."""
-    stiffness = SpikeAndSlab.build(spike=SPIKE, rungs=RUNGS, spread=SPREAD, even=EVEN, partial=PARTIAL)
+    stiffness = SpikeAndSlab.build(
+        spike=SPIKE, components=COMPONENTS, spread=SPREAD, dirichlet_strength=DIRICHLET_STRENGTH, partial=PARTIAL
+    )
     edges = np.stack([np.arange(N - 1), np.arange(1, N)], axis=1)
     prior = AttachmentPrior.build(N, edges, stiffness=stiffness, probability=0.05, coupling=1.0)
     true = jnp.where(jnp.arange(N) < 6, 0.03, 0.0)

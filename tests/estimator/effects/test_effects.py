@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jiggle_mj.estimator.effects import LIBRARY, Effect
-from jiggle_mj.estimator.effects.sheet_model import STOOD, Moment, SheetModel, centred, tangents, undisturbed
+from jiggle_mj.estimator.effects.sheet_model import STOOD, FrameContext, SheetModel, centred, nominal_energy, tangents
 from jiggle_mj.estimator.physics.environment import Weight
 from jiggle_mj.estimator.physics.membrane import TriangleMembrane
 from jiggle_mj.estimator.physics.mesh import SheetMesh
@@ -30,7 +30,7 @@ def moment():
     states = jnp.asarray(np.stack([one.x for one in lifts()[:4]]))
     times = jnp.array([0.0, 0.5, 1.25, 2.0])
     ways = jnp.asarray(np.outer([0.0, 1.0, 2.0, 3.0], WAY))
-    return Moment(
+    return FrameContext(
         rest=jnp.asarray(sheet().rest),
         time=times[2],
         gap=times[2] - times[1],
@@ -50,14 +50,14 @@ def moment():
 @pytest.fixture(scope="module")
 def plain(moment):
     return SheetModel(
-        energy=undisturbed(sheet(), DECLARATION),
+        energy=nominal_energy(sheet(), DECLARATION),
         tool=jnp.asarray(2 * WAY),
         view=centred(sheet()),
         time=moment.time,
     )
 
 
-def shown(effect: Effect, plain: SheetModel, moment: Moment):
+def shown(effect: Effect, plain: SheetModel, moment: FrameContext):
     """Forces at the frame's state, where it is seen, the tool's way and the anchors, in comparable units."""
     x, membrane = moment.now, plain.term(TriangleMembrane)
     force, length = 1e-4, 1e-4
@@ -185,9 +185,9 @@ def test_a_late_report_is_where_the_tool_was(plain, moment):
 
 def test_a_turned_way_is_as_long(plain, moment):
     with jax.enable_x64(True):
-        turned = EFFECTS["tool_turn"].acts(plain, jnp.array([0.0, np.pi / 2, 0.0]), moment)
+        rotated = EFFECTS["tool_turn"].acts(plain, jnp.array([0.0, np.pi / 2, 0.0]), moment)
         x, y, z = 2 * WAY
-        np.testing.assert_allclose(turned.tool, [z, y, -x], atol=1e-12)
+        np.testing.assert_allclose(rotated.tool, [z, y, -x], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -254,10 +254,12 @@ def test_nothing_slides_at_zero_over_a_sheet_that_was_bent_and_turned_at_rest(pl
     with jax.enable_x64(True):
         flat = sheet().rest
         bent = np.column_stack([flat[:, 0], flat[:, 1], 4 * flat[:, 0] ** 2])
-        turned = bent @ Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix().T
-        mesh = SheetMesh(turned, sheet().faces)
-        model = SheetModel(energy=undisturbed(mesh, DECLARATION), tool=plain.tool, view=centred(mesh), time=plain.time)
-        there = dataclasses.replace(moment, rest=jnp.asarray(turned))
+        rotated = bent @ Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix().T
+        mesh = SheetMesh(rotated, sheet().faces)
+        model = SheetModel(
+            energy=nominal_energy(mesh, DECLARATION), tool=plain.tool, view=centred(mesh), time=plain.time
+        )
+        there = dataclasses.replace(moment, rest=jnp.asarray(rotated))
         for theta in (0.0, 1e-12):
             view = EFFECTS["point_slip"].acts(model, jnp.full(3, theta), there).view
             seen = view(moment.now, tangents=tangents(model.term(TriangleMembrane), moment.now))

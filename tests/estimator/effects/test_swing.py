@@ -10,13 +10,13 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
 from jiggle_mj.estimator.attribution.closing import close_the_loop
+from jiggle_mj.estimator.attribution.dataset import collect_dataset
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
-from jiggle_mj.estimator.attribution.gather import gather
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY
-from jiggle_mj.estimator.effects.sheet_model import undisturbed
+from jiggle_mj.estimator.effects.sheet_model import nominal_energy
 from jiggle_mj.estimator.effects.swing import BESSEL
-from jiggle_mj.estimator.effects.terms import Load
+from jiggle_mj.estimator.effects.terms import DeadLoad
 from jiggle_mj.estimator.physics.environment import Weight
 from jiggle_mj.estimator.physics.mesh import SheetMesh
 from jiggle_mj.eval.report.discrepancy_page import story
@@ -43,7 +43,7 @@ def pull(hung: SheetMesh, at: float, theta: list[float], late: float = 0.0) -> n
     with jax.enable_x64(True):
         model, moment = at_rest(hung, AIR, at=at, times=REPORTS, ways=WAYS)
         then = LATE.acts(model, jnp.asarray([late]), moment)
-        force = SWING.acts(then, jnp.asarray(theta), moment).term(Load).force
+        force = SWING.acts(then, jnp.asarray(theta), moment).term(DeadLoad).force
         per_mass = np.asarray(force / model.term(Weight).mass[:, None])
         np.testing.assert_allclose(per_mass, np.broadcast_to(per_mass[0], per_mass.shape), atol=1e-12)
         return per_mass[0]
@@ -87,7 +87,7 @@ def test_its_period_is_that_of_the_lowest_mode_of_a_sheet_that_hangs(hung):
     """By the eigenvalues of the sheet's own stiffness and mass, about where its weight takes it."""
     limp = dataclasses.replace(AIR, membrane_stiffness=300.0, thickness=1e-4, poisson=0.0)
     with jax.enable_x64(True):
-        energy = undisturbed(hung, limp)
+        energy = nominal_energy(hung, limp)
         mass = next(np.repeat(np.asarray(term.mass), 3) for term in energy.terms if isinstance(term, Weight))
         free = np.repeat(hung.rest[:, 2] < hung.rest[:, 2].max() - 1e-6, 3)
         force = jax.jit(lambda x: energy.internal_gradient(x.reshape(-1, 3)).ravel())
@@ -118,9 +118,9 @@ def test_it_swings_by_that_period_in_the_reference_too():
 @pytest.mark.slow
 def test_what_swings_in_the_reference_is_named_first_by_its_own_mass_and_foretold():
     """Beside it `material_damping` may be named: what swings there has more than one mode, and is damped."""
-    gathered = gather(SHEET, None, recording(4, seed=0))
+    dataset = collect_dataset(SHEET, None, recording(4, seed=0))
     with jax.enable_x64(True), one_thread():
-        found = discrepancy(close_the_loop(gathered), gathered)
+        found = discrepancy(close_the_loop(dataset), dataset)
     names = [one["name"] for one in found["effects"]]
     assert names[0] == "swing", story(found)
     assert {*names} <= {"swing", "material_damping"}, story(found)

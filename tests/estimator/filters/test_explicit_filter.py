@@ -9,7 +9,7 @@ import pytest
 from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
 from jiggle_mj.estimator.filters.evidence import Evidence, Pull
 from jiggle_mj.estimator.filters.explicit import non_negative, update
-from jiggle_mj.estimator.filters.shots import History, Shots, draw_samples, predicted
+from jiggle_mj.estimator.filters.shots import ShotHistory, Shots, draw_samples, predicted
 from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.membrane import EdgeMembrane
 from jiggle_mj.estimator.physics.xpbd import XPBD, hinge_springs
@@ -128,7 +128,7 @@ def test_the_latest_sample_is_always_drawn_and_none_from_before_the_cut():
     assert set(np.concatenate(drawn).tolist()) == {0, 1, 2, 3, 4, 5}
     assert draw_samples(0, 3, np.random.default_rng(0)).tolist() == [0]
 
-    history = History(grip_stiffness=90.0, samples=3)
+    history = ShotHistory(grip_stiffness=90.0, samples=3)
     for height in (1.0, 2.0, 3.0):
         history.add(step(height))
     history.forget()
@@ -142,4 +142,4 @@ def step(height: float) -> Evidence:
     one, x = np.ones(MESH.n, bool), jnp.asarray(MESH.rest)
     pull = Pull(before=x, tip=jnp.asarray([0.0, 0.0, height]), length=jnp.ones(MESH.n))
     precision = jnp.broadcast_to(jnp.eye(3), (MESH.n, 3, 3))
-    return Evidence(y=x, precision=precision, held=jnp.asarray(one), loaded=jnp.asarray(one), pull=pull)
+    return Evidence(y=x, precision=precision, held=jnp.asarray(one), force_unknown=jnp.asarray(one), pull=pull)

@@ -60,7 +60,7 @@ def frame(number: int, hidden: np.ndarray | None = None, lie: float = 0.0) -> Ev
     held = jnp.asarray(now.held)
     length = np.linalg.norm(sheet().rest - corners()[0], axis=1)
     pull = Pull(before=jnp.asarray(before.x), tip=jnp.asarray(now.tip), length=jnp.asarray(length))
-    return Evidence(y=jnp.asarray(y), precision=jnp.asarray(precision), held=held, loaded=held, pull=pull)
+    return Evidence(y=jnp.asarray(y), precision=jnp.asarray(precision), held=held, force_unknown=held, pull=pull)
 
 
 def prior(filter: Filter) -> BoundaryBelief | AttachmentBelief:
@@ -83,8 +83,8 @@ def test_every_filter_sharpens_stays_non_negative_and_repeats_itself(make):
     entropies = [float(prior(make()).entropy()), *(float(out.entropy) for out in first)]
     if make is adam:
         for out in first:
-            stated = (out.sd, out.entropy, out.nis, *out.belief.moments())
-            assert all(np.isnan(np.asarray(part)).all() for part in stated)
+            summary = (out.sd, out.entropy, out.nis, *out.belief.moments())
+            assert all(np.isnan(np.asarray(part)).all() for part in summary)
     else:
         assert (np.diff(entropies) < 0).all()
         assert all(np.asarray(out.sd).max() <= 1 + 1e-9 or make is implicit for out in first)
@@ -116,8 +116,8 @@ def test_a_frame_without_a_state_is_said_to_be_so_and_forgotten(make):
     assert not (np.isfinite(refused.x).all() and np.isfinite(refused.b).all())
     after, as_if = filter.update(first.belief, first.b, good[1], good[1].y), run(make(), good)[-1]
     np.testing.assert_array_equal(after.b, as_if.b)
-    if (judged := filter.release(after.belief)) is not None:
-        assert np.isfinite(judged.b).all()
+    if (refined := filter.release(after.belief)) is not None:
+        assert np.isfinite(refined.b).all()
 
 
 @pytest.mark.parametrize("make", [explicit, adam, unscented])

@@ -113,7 +113,7 @@ def test_a_missing_particle_has_no_influence():
         y=jnp.where(jnp.asarray(unseen)[:, None], seen.y + 0.3, seen.y),
         precision=seen.precision,
         held=seen.held,
-        loaded=seen.loaded,
+        force_unknown=seen.force_unknown,
     )
     outs = []
     for one in (seen, other):
@@ -127,5 +127,5 @@ def test_a_release_without_a_frame_since_the_last_changes_nothing():
     frame, filter = lifts()[3], implicit()
     seen = observed(frame, 5)
     out = filter.update(sheet_prior(), jnp.zeros(sheet().n), seen, seen.y)
-    stated = filter.release(out.belief)
-    assert filter.release(stated.belief) is None
+    summary = filter.release(out.belief)
+    assert filter.release(summary.belief) is None

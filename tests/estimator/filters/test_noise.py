@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.filters.evidence import Stated
+from jiggle_mj.estimator.filters.evidence import PosteriorSummary
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
-from jiggle_mj.estimator.filters.noise import Misfit, Noise
+from jiggle_mj.estimator.filters.noise import ForceResiduals, Noise
 from tests.support.small_sheet import NOISE, attached, follow, lifts, observed, sheet_balance
 
 FORCE_SD = 1e-3
@@ -20,14 +20,14 @@ DRAWS = 60
 
 
 @pytest.fixture(scope="module")
-def drawn() -> list[Misfit]:
+def drawn() -> list[ForceResiduals]:
     """Of frames whose errors are drawn from the model, linear around a lifted state with half of s rigid."""
     balance, truth = sheet_balance(FORCE_SD), lifts()[3]
     seen, s = observed(truth, 0), jnp.asarray(0.5 * attached())
     frame = eqx.filter_jit(balance.linearise)(jnp.asarray(truth.x), s, seen)
 
     @eqx.filter_jit
-    def misfit(balance: ForceBalance, draw: jax.Array) -> Misfit:
+    def misfit(balance: ForceBalance, draw: jax.Array) -> ForceResiduals:
         own, others = jax.random.normal(draw, (2, *frame.x.shape))
         sd = jnp.where(frame.weight > 0, 1 / jnp.sqrt(frame.weight), 0.0)
         seen_sd = 1 / jnp.sqrt(seen.precision[:, 0, 0])
@@ -65,14 +65,14 @@ def test_noise_is_never_narrower_than_typed_and_keeps_still_about_right(drawn):
 
 
 @pytest.fixture(scope="module")
-def runs() -> dict[int, tuple[Noise, Stated]]:
+def runs() -> dict[int, tuple[Noise, PosteriorSummary]]:
     return {times: run(times) for times in (1, 4)}
 
 
 @pytest.mark.parametrize("times", [1, 4])
 def test_the_filter_finds_how_noisy_positions_are(runs, times):
-    noise, stated = runs[times]
-    assert stated.converged
+    noise, summary = runs[times]
+    assert summary.converged
     assert noise.position == pytest.approx(times**2, rel=0.2)
 
 
@@ -86,7 +86,7 @@ def test_positions_noisier_than_stated_do_not_make_the_filter_report_what_is_not
     assert surprise(learned) < 0.6 * surprise(typed)
 
 
-def run(times: float) -> tuple[Noise, Stated]:
+def run(times: float) -> tuple[Noise, PosteriorSummary]:
     """All lifts, with that many times the stated noise."""
     filter, rng = ImplicitFilter(sheet_balance(1e-4)), np.random.default_rng(1)
     noisy = [frame.x + times * NOISE * rng.normal(size=frame.x.shape) for frame in lifts()]
@@ -94,15 +94,15 @@ def run(times: float) -> tuple[Noise, Stated]:
         eqx.tree_at(lambda one: one.y, observed(frame, 0), jnp.asarray(y))
         for frame, y in zip(lifts(), noisy, strict=True)
     ]
-    _, stated = follow(filter, lifts(), seen)
-    return filter.noise, stated
+    _, summary = follow(filter, lifts(), seen)
+    return filter.noise, summary
 
 
-def found(stated: Stated) -> np.ndarray:
-    return np.asarray(stated.probability) > 0.5
+def found(summary: PosteriorSummary) -> np.ndarray:
+    return np.asarray(summary.probability) > 0.5
 
 
-def surprise(stated: Stated) -> float:
+def surprise(summary: PosteriorSummary) -> float:
     """Mean negative logarithm of what P(attached) says of the truth [nat]."""
-    of_truth = np.where(attached(), stated.probability, 1 - np.asarray(stated.probability))
+    of_truth = np.where(attached(), summary.probability, 1 - np.asarray(summary.probability))
     return float(-np.mean(np.log(of_truth)))

@@ -45,9 +45,9 @@ def test_sampled_points_lie_on_the_mesh():
     chamfer = Chamfer.build(sheet(), count=400, reach=np.inf)
     np.testing.assert_allclose(np.sum(chamfer.weights, axis=1), 1, rtol=1e-12)
     assert (np.asarray(chamfer.weights) > -1e-12).all()
-    turned = lambda x: x[:, [1, 2, 0]] + 0.1  # noqa: E731
+    rotated = lambda x: x[:, [1, 2, 0]] + 0.1  # noqa: E731
     rest = jnp.asarray(sheet().rest)
-    np.testing.assert_allclose(chamfer.sampled(turned(rest)), turned(chamfer.sampled(rest)), atol=1e-12)
+    np.testing.assert_allclose(chamfer.sampled(rotated(rest)), rotated(chamfer.sampled(rest)), atol=1e-12)
 
 
 def test_points_that_are_nan_are_nearest_to_nothing():

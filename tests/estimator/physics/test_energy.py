@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jiggle_mj.estimator.physics.bending import IsometricBending
 from jiggle_mj.estimator.physics.energy import Term
-from jiggle_mj.estimator.physics.environment import Bed, Grip, Tether, Weight
+from jiggle_mj.estimator.physics.environment import BedContact, Grip, Tether, Weight
 from jiggle_mj.estimator.physics.hanging import Tension
 from jiggle_mj.estimator.physics.membrane import EdgeMembrane, TriangleMembrane
 from jiggle_mj.estimator.physics.surrogate import surrogate
@@ -55,7 +55,7 @@ def terms() -> dict[str, Term]:
         "bending": IsometricBending.build(MESH, stiffness=PLATE),
         "bending of a rough sheet": IsometricBending.build(ROUGH, stiffness=PLATE),
         "weight": Weight.build(MESH.particle_area, areal_density=1.0, gravity=(0.0, 1.0, -9.81)),
-        "bed": Bed.build(MESH.rest, load=np.full(MESH.n, 2e-3), up=np.array([0.0, 0.0, 1.0]), stiffness=10.0),
+        "bed": BedContact.build(MESH.rest, load=np.full(MESH.n, 2e-3), up=np.array([0.0, 0.0, 1.0]), stiffness=10.0),
         "grip": Grip.build(jnp.asarray(MESH.rest), jnp.asarray(TIP), radius=8e-3, stiffness=100.0),
         "tether": tether,
         "tension": tension,

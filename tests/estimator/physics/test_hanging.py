@@ -57,9 +57,9 @@ def test_what_it_weighs_and_how_stiff_it_is_change_nothing_where_it_was_seen(nam
 
 def test_a_sheet_that_leans_is_pulled_within_its_plane_and_one_that_is_held_up_is_not():
     for lean, taken in ((np.radians(5), True), (np.radians(-8), True), (np.radians(30), False)):
-        turned = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
-        mesh = SheetMesh(HUNG.rest @ turned.T, HUNG.faces)
+        rotated = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
+        mesh = SheetMesh(HUNG.rest @ rotated.T, HUNG.faces)
         terms = surrogate(mesh, AIR).terms
         pulled = next(np.asarray(term.gravity) for term in terms if isinstance(term, Weight))
-        np.testing.assert_allclose(pulled, turned @ [0, 0, -G] if taken else [0, 0, -G], atol=1e-12)
+        np.testing.assert_allclose(pulled, rotated @ [0, 0, -G] if taken else [0, 0, -G], atol=1e-12)
         assert any(isinstance(term, Tension) for term in terms) == taken

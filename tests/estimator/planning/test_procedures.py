@@ -7,7 +7,7 @@ import pytest
 from jiggle_mj.errors import ActionError
 from jiggle_mj.estimate import Detection, Sheet
 from jiggle_mj.estimator.estimator import Estimator
-from jiggle_mj.estimator.planning.information_policy import Information
+from jiggle_mj.estimator.planning.information_policy import InformationPolicy
 from jiggle_mj.estimator.planning.policy import Decision
 from jiggle_mj.estimator.planning.procedures import CERTAIN, CYCLE, Sew, free_stretch, tour
 from jiggle_mj.observation import Grasp, Move, Suture
@@ -41,7 +41,7 @@ def test_where_nothing_is_known_to_be_free_there_is_none():
     assert stretch(np.full(sheet().n, 0.0)) is not None
 
 
-class Looking(Information):
+class Looking(InformationPolicy):
     """Moves until it is told to leave."""
 
     def __init__(self, *, enough=None, about=None):

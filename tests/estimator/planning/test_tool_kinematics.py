@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from jiggle_mj.errors import OptionError
-from jiggle_mj.estimator.planning.tool_kinematics import Tweezer, clearances
+from jiggle_mj.estimator.planning.tool_kinematics import ToolKinematics, clearances
 from jiggle_mj.scenes.tissue.model import TWEEZER
 
 
 @pytest.fixture(scope="module")
-def tweezer() -> Tweezer:
-    return Tweezer.read(TWEEZER.read_text())
+def tweezer() -> ToolKinematics:
+    return ToolKinematics.read(TWEEZER.read_text())
 
 
 def lowest(tip: np.ndarray, quat: np.ndarray) -> float:
@@ -77,4 +77,4 @@ def test_clearance_is_differentiable_in_tip_and_orientation(tweezer):
 )
 def test_a_tool_that_cannot_be_read_is_refused(mjcf, says):
     with pytest.raises(OptionError, match=says):
-        Tweezer.read(mjcf)
+        ToolKinematics.read(mjcf)

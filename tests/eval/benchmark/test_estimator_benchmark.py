@@ -11,7 +11,7 @@ from jiggle_mj.eval.benchmark import estimator_benchmark as bench
 @pytest.mark.slow
 def test_a_small_benchmark_has_its_figures_and_finds_the_disc():
     """A sheet of 9 by 9 particles, as in other tests."""
-    metrics = bench.benchmark((85,), paper=False, say=lambda _: None)
+    metrics = bench.benchmark((85,), paper=False, log=lambda _: None)
     assert {"device", "equilibrium_n85_s", "update_n85_s", "update_n85_compile_s", "found_share"} <= set(metrics)
     assert float(metrics["update_n85_s"]["value"]) > 0
     assert float(metrics["found_share"]["value"]) > 0.75  # all called free: 0.728
@@ -21,7 +21,7 @@ def test_a_small_benchmark_has_its_figures_and_finds_the_disc():
 @pytest.mark.slow
 def test_beyond_the_largest_belief_the_solver_alone_is_timed(monkeypatch):
     monkeypatch.setattr(bench, "LARGEST", 0)
-    metrics = bench.benchmark((40, 85), paper=False, say=lambda _: None)
+    metrics = bench.benchmark((40, 85), paper=False, log=lambda _: None)
     times = {"equilibrium_n40_s", "equilibrium_n85_s", "equilibrium_exponent"}
     assert set(metrics) == {"device", "peak_memory"} | times
     assert 0.05 < float(metrics["peak_memory"]["value"]) < 20  # JAX and a test's process, in GiB

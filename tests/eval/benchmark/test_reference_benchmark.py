@@ -15,7 +15,7 @@ def test_it_times_increments_pairs_and_an_episode(monkeypatch):
     small = bench.sized(60)
     monkeypatch.setattr(bench, "load_scene", lambda name: small)
     monkeypatch.setattr(bench, "PAIRS", 3)
-    metrics = bench.reference_benchmark((60, 120), say=lambda _: None)
+    metrics = bench.reference_benchmark((60, 120), log=lambda _: None)
     small_one, large, slope = (
         float(metrics[f"reference_increment_{end}"]["value"]) for end in ("n60_s", "n120_s", "exponent")
     )

@@ -161,18 +161,18 @@ def test_dilation_by_two_is_dilation_twice(one):
 def test_truth_carries_over_unchanged_to_the_same_mesh():
     rest, faces = lattice(4, 0.01)
     stiffness = np.where(rest[:, 0] == 0, 0.7, 0.0)
-    carried = carry(Sheet(rest=rest, faces=faces), truth_of(rest, faces, stiffness), 0)
-    np.testing.assert_array_equal(carried.attached, stiffness > 0)
-    np.testing.assert_allclose(carried.stiffness, stiffness, atol=1e-12)
+    transferred = carry(Sheet(rest=rest, faces=faces), truth_of(rest, faces, stiffness), 0)
+    np.testing.assert_array_equal(transferred.attached, stiffness > 0)
+    np.testing.assert_allclose(transferred.stiffness, stiffness, atol=1e-12)
 
 
 def test_springs_keep_their_total_and_their_centre_on_any_mesh():
     """A patch's total and first moment; the nearest vertex would give a border particle all or nothing."""
     fine, coarse = lattice(13, 0.01), lattice(7, 0.017)
     stiffness = np.where(np.linalg.norm(fine[0][:, :2] - 0.05, axis=1) < 0.023, 0.7, 0.0)
-    carried = carry(Sheet(rest=coarse[0], faces=coarse[1]), truth_of(*fine, stiffness), 0)
-    assert carried.stiffness.sum() == pytest.approx(stiffness.sum(), rel=1e-12)
-    np.testing.assert_allclose(carried.stiffness @ coarse[0], stiffness @ fine[0], rtol=1e-12)
+    transferred = carry(Sheet(rest=coarse[0], faces=coarse[1]), truth_of(*fine, stiffness), 0)
+    assert transferred.stiffness.sum() == pytest.approx(stiffness.sum(), rel=1e-12)
+    np.testing.assert_allclose(transferred.stiffness @ coarse[0], stiffness @ fine[0], rtol=1e-12)
 
 
 def test_a_spring_pulls_at_the_corners_of_the_triangle_that_it_is_in():
@@ -180,9 +180,9 @@ def test_a_spring_pulls_at_the_corners_of_the_triangle_that_it_is_in():
     further away than an edge is long is of another part of the tissue."""
     sheet = Sheet(rest=np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), faces=np.array([[0, 1, 2]]))
     rest = np.array([[0.2, 0.3, 0], [0, 0, 0], [0, 1, 0], [-1.5, 0, 0]])
-    carried = carry(sheet, truth_of(rest, np.array([[0, 1, 2]]), [10.0, 0, 0, 99.0]), 0)
-    np.testing.assert_allclose(carried.stiffness, [5, 2, 3])
-    assert carried.attached.tolist() == [False, True, False]
+    transferred = carry(sheet, truth_of(rest, np.array([[0, 1, 2]]), [10.0, 0, 0, 99.0]), 0)
+    np.testing.assert_allclose(transferred.stiffness, [5, 2, 3])
+    assert transferred.attached.tolist() == [False, True, False]
 
 
 def test_loads_add_up_in_squares_until_the_frame():
@@ -195,9 +195,9 @@ def test_loads_add_up_in_squares_until_the_frame():
         for k, load in enumerate((3e-3, 4e-3, 1.0))
     )
     truth = Truth(rest=rest, faces=faces, attached=np.ones(4, bool), frames=frames, scene="", details={})
-    carried = carry(Sheet(rest=rest, faces=faces), truth, 1)
-    np.testing.assert_allclose(carried.load, [5e-3, 0, 0, 0])
-    assert carried.observable is not None and carried.observable.tolist() == [True, False, False, False]
+    transferred = carry(Sheet(rest=rest, faces=faces), truth, 1)
+    np.testing.assert_allclose(transferred.load, [5e-3, 0, 0, 0])
+    assert transferred.observable is not None and transferred.observable.tolist() == [True, False, False, False]
     assert carry(Sheet(rest=rest, faces=faces), truth_of(rest, faces, np.ones(4)), 0).observable is None
 
 

@@ -19,7 +19,7 @@ from jiggle_mj.errors import OutputError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.eval.metrics.flat_map import grid_of, outline, plane_of
 from jiggle_mj.eval.metrics.score import result, with_truth
-from jiggle_mj.eval.metrics.truth_transfer import CarriedTruth, carry
+from jiggle_mj.eval.metrics.truth_transfer import TransferredTruth, carry
 from jiggle_mj.eval.report.pictures import pictures
 from jiggle_mj.eval.report.run_page import write_report
 from jiggle_mj.eval.report.verdict import against_truth, doubts, found, stiffness_sums
@@ -306,17 +306,17 @@ def test_the_sentence_counts_patches_and_hits_by_hand():
     assert said.startswith("3 particles are reported attached, in 2 patches (2 around x = 5 mm, y = 5 mm; 1 around x =")
     assert said.endswith("at 0.8 N/m each on average.")
     attached = np.isin(np.arange(10), [0, 4, 5])
-    told = against_truth(sheet, detection, CarriedTruth(attached=attached, stiffness=attached * 1.0))
+    told = against_truth(sheet, detection, TransferredTruth(attached=attached, stiffness=attached * 1.0))
     assert "In truth 3 are attached: 1 of them reported exactly, 1 within one mesh ring;" in told
     assert told.endswith("1 of the 3 reports lies more than one ring off.")
-    carried = CarriedTruth(attached=mask, stiffness=mask * 1.5)
+    transferred = TransferredTruth(attached=mask, stiffness=mask * 1.5)
     belief = Belief(mean=np.full(10, 0.8), covariance=0.01 * np.eye(10) + 0.01)
     # A ring around 0, 1 and 9 is 0-3, 7-9: seven times 0.8; variance 7 * 0.01 + 49 * 0.01; truth 3 * 1.5.
-    summed = stiffness_sums(sheet, belief, detection, carried)
+    summed = stiffness_sums(sheet, belief, detection, transferred)
     assert "sums to 5.6 N/m, with a stated standard deviation of 0.7; the truth is 4.5." in summed
-    welded = replace(carried, stiffness=np.where(mask, np.inf, 0.0))
+    welded = replace(transferred, stiffness=np.where(mask, np.inf, 0.0))
     assert stiffness_sums(sheet, belief, detection, welded) == ""
-    nothing = CarriedTruth(attached=np.zeros(10, bool), stiffness=np.zeros(10))
+    nothing = TransferredTruth(attached=np.zeros(10, bool), stiffness=np.zeros(10))
     assert against_truth(sheet, detection, nothing) == "In truth nothing is attached. All 3 reports are false."
 
 
@@ -387,6 +387,6 @@ def test_the_page_runs_in_chromium_without_a_console_error(tmp_path, truth, imag
 def test_the_synthetic_truth_is_carried_over_as_it_was_made():
     """Guards the fixture: the two lines exist on both meshes, or every picture above would be of nothing."""
     run = synthetic()
-    carried = carry(run["sheet"], run["truth"], 36)
-    assert 20 < carried.attached.sum() < 80
+    transferred = carry(run["sheet"], run["truth"], 36)
+    assert 20 < transferred.attached.sum() < 80
     assert 550 < len(run["sheet"].rest) < 750

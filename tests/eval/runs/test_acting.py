@@ -14,7 +14,7 @@ from jiggle_mj.cli.terminal import patient
 from jiggle_mj.errors import ActionError, OptionError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.planning import information_policy as information
-from jiggle_mj.estimator.planning.information_policy import LOST, Information
+from jiggle_mj.estimator.planning.information_policy import LOST, InformationPolicy
 from jiggle_mj.estimator.planning.policy import STEP, Policy
 from jiggle_mj.eval.runs.acting import actions, check_goes_with, most_actions, policy_named
 from jiggle_mj.eval.runs.experiment import run_scene
@@ -38,7 +38,7 @@ class Loop:
 
     def __init__(self, scene, policy: Policy, *, steps: int):
         with Reference(scene, seed=0, sensing="particles") as reference:
-            config = EstimatorConfig(judging="frames")
+            config = EstimatorConfig(refinement="frames")
             self.estimator = Estimator(reference.declaration, reference.camera, config=config)
             self.done, self.entropy = [], []
             for action in actions(scene, policy, self.estimator, steps):
@@ -83,12 +83,14 @@ def test_the_same_seed_plans_the_same(scene, ours):
 def test_a_second_look_at_each_frame_is_nearer_to_the_truth(scene):
     """Mean squared error of P(attached) over the frames of the first lift, of the disc in the middle."""
     error = {}
-    for judging in ("grasps", "frames"):
+    for refinement in ("grasps", "frames"):
         with Reference(scene, seed=0, sensing="particles") as reference:
-            estimator = Estimator(reference.declaration, reference.camera, config=EstimatorConfig(judging=judging))
+            estimator = Estimator(
+                reference.declaration, reference.camera, config=EstimatorConfig(refinement=refinement)
+            )
             found = [estimator.update(reference.step(action)) for action in islice(programme(scene), 6)]
         held = np.linalg.norm(estimator.sheet.rest[:, :2], axis=1) < 12e-3
-        error[judging] = np.mean([(one.probability - held) ** 2 for one in found if one is not None])
+        error[refinement] = np.mean([(one.probability - held) ** 2 for one in found if one is not None])
     assert error["frames"] < 0.95 * error["grasps"]
 
 
@@ -105,7 +107,7 @@ def test_the_papers_policies_move_the_grasp_that_they_are_given(scene, name):
 
 
 def test_where_nothing_is_safe_nothing_is_grasped_and_it_says_so(scene):
-    policy = Information(Limits(force=1e-9, energy=1e-20), radius=8e-3, seed=0)
+    policy = InformationPolicy(Limits(force=1e-9, energy=1e-20), radius=8e-3, seed=0)
     loop = Loop(scene, policy, steps=8)
     assert not any(isinstance(action, Grasp) for action in loop.done)
     assert policy.ended.startswith("no safe pull teaches ") and "not decided" in policy.ended
@@ -131,7 +133,7 @@ def test_ours_without_regrasping_closes_the_jaws_and_lifts_nothing_unasked(scene
 
 
 def test_a_grasp_from_which_little_is_to_be_learned_is_left(ours):
-    policy = Information(Limits(), radius=8e-3, seed=0, regrasps=False, enough=np.inf)
+    policy = InformationPolicy(Limits(), radius=8e-3, seed=0, regrasps=False, enough=np.inf)
     assert policy.plan(ours[1].estimator) == "little is left to learn"
 
 
@@ -140,8 +142,8 @@ def test_another_place_is_worth_going_to_if_it_teaches_more_than_it_costs_to_get
     _, loop = ours
     here = loop.estimator.tool.position + np.array([0, 0, STEP])
     monkeypatch.setattr(information, "REGRASP", cost)
-    monkeypatch.setattr(Information, "_best_pull", lambda *_: (here, 1e-3))
-    action, why = Information(Limits(), radius=8e-3, seed=0, enough=0.0).plan(loop.estimator)
+    monkeypatch.setattr(InformationPolicy, "_best_pull", lambda *_: (here, 1e-3))
+    action, why = InformationPolicy(Limits(), radius=8e-3, seed=0, enough=0.0).plan(loop.estimator)
     assert (why == "another place teaches more") is goes
     assert isinstance(action, Move)
     np.testing.assert_array_equal(action.to, loop.estimator.hold.tip if goes else here)
@@ -152,7 +154,7 @@ def test_where_every_attachment_is_decided_enough_is_known(ours, monkeypatch):
     opened = replace(loop.estimator.tool, closed=False)
     monkeypatch.setattr(Estimator, "tool", property(lambda _: opened))
     nothing = np.zeros(len(loop.estimator.sheet.rest), bool)
-    said = Information(Limits(), radius=8e-3, seed=0, about=nothing).plan(loop.estimator)
+    said = InformationPolicy(Limits(), radius=8e-3, seed=0, about=nothing).plan(loop.estimator)
     assert said == "enough is known: every P(attached) is below 0.05 or above 0.95"
 
 
@@ -179,7 +181,7 @@ def test_a_grasp_that_slipped_is_let_go(ours, monkeypatch):
     if loop.estimator.hold is None:
         pytest.fail("the last step of the run has tissue in the jaws")
     monkeypatch.setattr(Estimator, "slip", property(lambda _: 2 * LOST))
-    fresh = Information(Limits(), radius=8e-3, seed=0)
+    fresh = InformationPolicy(Limits(), radius=8e-3, seed=0)
     action, why = fresh.plan(loop.estimator)
     assert isinstance(action, Release) and "slipped out of the jaws by 10 mm" in why
 
@@ -187,7 +189,7 @@ def test_a_grasp_that_slipped_is_let_go(ours, monkeypatch):
 def test_jaws_that_closed_unseen_are_opened(ours, monkeypatch):
     _, loop = ours
     monkeypatch.setattr(Estimator, "hold", property(lambda _: None))
-    action, why = Information(Limits(), radius=8e-3, seed=0).plan(loop.estimator)
+    action, why = InformationPolicy(Limits(), radius=8e-3, seed=0).plan(loop.estimator)
     assert isinstance(action, Release) and "no frame has shown" in why
 
 
@@ -195,7 +197,7 @@ def test_a_tip_out_of_reach_is_taken_back_and_it_says_where_it_was(ours, monkeyp
     _, loop = ours
     far = replace(loop.estimator.tool, position=np.array([0.0, 0.0, 0.2]))
     monkeypatch.setattr(Estimator, "tool", property(lambda _: far))
-    action, why = Information(Limits(), radius=8e-3, seed=0).plan(loop.estimator)
+    action, why = InformationPolicy(Limits(), radius=8e-3, seed=0).plan(loop.estimator)
     assert isinstance(action, Move) and "the tip at (0, 0, 200) mm is out of reach" in why
     np.testing.assert_array_equal(action.to, loop.estimator.hold.tip)
 
@@ -240,7 +242,7 @@ def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, mo
     assert figures["procedure"] is None
 
 
-class Corners(Information):
+class Corners(InformationPolicy):
     """Four corner lifts, wherever the corners lie, in place of looks that take minutes."""
 
     refused = Policy.refused

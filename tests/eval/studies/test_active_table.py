@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jiggle_mj.eval.metrics.safety import Borne
-from jiggle_mj.eval.metrics.truth_transfer import CarriedTruth
+from jiggle_mj.eval.metrics.truth_transfer import TransferredTruth
 from jiggle_mj.eval.studies import active_table
 from jiggle_mj.eval.studies.active_table import (
     BEST,
@@ -33,7 +33,7 @@ def course(total: float, *, energy: float = 1e-9, found_after: int = 5, load: fl
         fallen=np.linspace(0, total, STEPS + 1),
         borne=Borne(energy=np.full(STEPS + 1, energy), force=np.full(STEPS + 1, 1e-3)),
         detected=detected,
-        truth=CarriedTruth(attached=ATTACHED, stiffness=1.0 * ATTACHED, load=load * ATTACHED),
+        truth=TransferredTruth(attached=ATTACHED, stiffness=1.0 * ATTACHED, load=load * ATTACHED),
         faces=FACES,
         result={"safety": {"limit_j": 1e-7, "limit_n": 1e-2}, "timing": {"plan_s": 2.0}},
     )
@@ -96,11 +96,11 @@ def test_the_curves_are_the_same_bytes_twice(tmp_path):
 def test_only_what_is_missing_is_run(tmp_path, monkeypatch):
     done, left = {"arc-sl-d-particles-0"}, []
     monkeypatch.setattr(active_table, "finished", lambda folder, _: {} if folder.name in done else None)
-    monkeypatch.setattr(active_table, "carry_out", lambda runs, executor, say: left.extend(runs))
+    monkeypatch.setattr(active_table, "carry_out", lambda runs, executor, log: left.extend(runs))
     monkeypatch.setattr(active_table, "course", lambda folder: replace(course(1.0), result={"folder": folder.name}))
     with ThreadPoolExecutor(1) as executor:
         found = active_table.measure(
-            ("arc",), ("sl-d", "lg-d"), (0,), tmp_path, sensing="particles", executor=executor, say=left.append
+            ("arc",), ("sl-d", "lg-d"), (0,), tmp_path, sensing="particles", executor=executor, log=left.append
         )
     assert left == ["arc-lg-d-particles-0"]
     assert [one.result["folder"] for one in found.values()] == ["arc-sl-d-particles-0", "arc-lg-d-particles-0"]
@@ -112,5 +112,5 @@ def test_a_failed_run_says_so_and_ends_the_table():
 
     said = []
     with ThreadPoolExecutor(1) as executor, pytest.raises(ValueError, match="torn"):
-        carry_out({"one": dict, "two": fails, "three": dict}, executor, say=said.append)
+        carry_out({"one": dict, "two": fails, "three": dict}, executor, log=said.append)
     assert said == ["1 of 3: one"]

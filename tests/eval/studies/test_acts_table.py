@@ -42,6 +42,6 @@ def test_what_this_version_has_measured_is_not_run_again(tmp_path, monkeypatch):
     monkeypatch.setattr(acts_table, "verdicts", lambda scene, seed: ran.append((scene, seed)) or [GOOD])
     (tmp_path / "arc-0.json").write_text(json.dumps({VERSION: "another", "verdicts": []}))
     with ThreadPoolExecutor(1) as executor:
-        found = [measure(("arc",), (0, 1), tmp_path, executor=executor, say=lambda _: None) for _ in range(2)]
+        found = [measure(("arc",), (0, 1), tmp_path, executor=executor, log=lambda _: None) for _ in range(2)]
     assert sorted(ran) == [("arc", 0), ("arc", 1)]
     assert found == [{("arc", 0): [GOOD], ("arc", 1): [GOOD]}] * 2

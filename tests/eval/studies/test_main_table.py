@@ -8,11 +8,11 @@ import pytest
 from jiggle_mj.episode import settings
 from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.eval.studies import main_table as tables
-from jiggle_mj.eval.studies.main_table import MAIN, Row, markdown, measure
+from jiggle_mj.eval.studies.main_table import MAIN, MainRow, markdown, measure
 from jiggle_mj.recording.estimate import EstimateWriter
 from tests.support.scored_run import SHEET, scored, unscored, written
 
-ROW = Row(scene="arc", sensing="particles")
+ROW = MainRow(scene="arc", sensing="particles")
 
 
 @pytest.fixture
@@ -37,21 +37,21 @@ def runs(monkeypatch):
 
 def test_a_table_goes_on_where_it_stopped(runs, tmp_path):
     told = []
-    measure([ROW], (0,), tmp_path, say=told.append)
-    found = measure([ROW], (0, 1), tmp_path, say=told.append)
+    measure([ROW], (0,), tmp_path, log=told.append)
+    found = measure([ROW], (0, 1), tmp_path, log=told.append)
     assert runs == ["arc-particles-0", "arc-particles-1"]
     assert told == ["arc, particles, seed 0", "arc, particles, seed 1"]
     assert [figures["seed"] for figures in found[ROW]] == [0, 1]
 
 
 def test_a_run_that_was_not_scored_or_had_other_settings_is_made_again(runs, tmp_path):
-    measure([ROW], (0, 1), tmp_path, say=lambda _: None)
+    measure([ROW], (0, 1), tmp_path, log=lambda _: None)
     (tmp_path / "arc-particles-0" / "result.json").write_text(json.dumps(unscored()))
     other = tmp_path / "arc-particles-1"
     (other / "estimate.mcap").unlink()
     with EstimateWriter(other / "estimate.mcap", SHEET, settings(EstimatorConfig(detect_above=0.5))):
         pass
-    measure([ROW], (0, 1), tmp_path, say=lambda _: None)
+    measure([ROW], (0, 1), tmp_path, log=lambda _: None)
     assert runs == ["arc-particles-0", "arc-particles-1"] * 2
 
 

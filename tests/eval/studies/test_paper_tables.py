@@ -17,7 +17,7 @@ def test_a_same_engine_run_is_scored_and_not_repeated(tmp_path, monkeypatch):
     """One lift of a small sheet through the front door; Adam, which states no uncertainty, so that none is judged."""
     monkeypatch.setattr(paper_tables, "load_scene", lambda _: SCENE)
     cell, told = Cell(scene="small", reference="xpbd", method="Adam"), []
-    first, again = (measure(TABLES["one-lift"], [cell], (3,), tmp_path, say=told.append)[cell][0] for _ in range(2))
+    first, again = (measure(TABLES["one-lift"], [cell], (3,), tmp_path, log=told.append)[cell][0] for _ in range(2))
     assert told == ["small, xpbd, Adam, seed 3"] and again == first
     detection, entropy = first["detection"], first["entropy"]
     assert isinstance(detection, dict) and isinstance(entropy, dict)

@@ -146,7 +146,7 @@ def test_what_this_version_ran_is_not_run_again(tmp_path, monkeypatch, version, 
 
     monkeypatch.setattr(undeclared_table, "_run", run)
     with ThreadPoolExecutor(1) as executor:
-        runs = [measure(["tool scale"], [0, 1], tmp_path, executor=executor, say=lambda _: None) for _ in range(2)]
+        runs = [measure(["tool scale"], [0, 1], tmp_path, executor=executor, log=lambda _: None) for _ in range(2)]
     both = [("tool scale", 0), ("tool scale", 1)]
     assert ran == times * both
     assert [list(one) for one in runs] == [both, both]

@@ -12,7 +12,7 @@ from jiggle_mj.scenes import DISTURBANCES, Reference, disturbed
 from jiggle_mj.scenes.load_tests import hold
 from jiggle_mj.scenes.scene.attachments import Disc
 from jiggle_mj.scenes.scene.disturbance import TissueDisturbance
-from jiggle_mj.scenes.scene.scene import Bed, Scene, Tissue
+from jiggle_mj.scenes.scene.scene import BedConfig, Scene, TissueConfig
 from jiggle_mj.scenes.scene_file import scene_from_table
 from jiggle_mj.scenes.tissue.model import CONTACT_SOLIMP, CONTACT_SOLREF
 from jiggle_mj.scenes.tissue.simulation import Simulation
@@ -20,7 +20,7 @@ from jiggle_mj.truth import TruthFrame
 
 SCENE = Scene(
     name="lift",
-    tissue=Tissue(size=(0.1, 0.1), spacing=7e-3),
+    tissue=TissueConfig(size=(0.1, 0.1), spacing=7e-3),
     attachments=(Disc(centre=(0.0, 0.0), radius=0.016, stiffness=5.0),),
 )
 CORNER = np.array([-0.047, -0.047])
@@ -124,7 +124,8 @@ def test_a_leaning_bed_carries_a_leaning_sheet():
 
 
 WEIGHTLESS = disturbed(
-    Scene(name="floating", tissue=Tissue(size=(0.06, 0.06), spacing=8e-3), bed=Bed(present=False)), ["gravity=0"]
+    Scene(name="floating", tissue=TissueConfig(size=(0.06, 0.06), spacing=8e-3), bed=BedConfig(present=False)),
+    ["gravity=0"],
 )
 
 

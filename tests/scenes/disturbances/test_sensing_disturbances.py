@@ -18,7 +18,7 @@ from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.scenes import DISTURBANCES, Reference, disturbed, load_scene
 from jiggle_mj.scenes.scene.disturbance import SensingDisturbance
-from jiggle_mj.scenes.scene.scene import Camera, Scene, Sensing, Texture, Tissue
+from jiggle_mj.scenes.scene.scene import CameraConfig, Scene, SensingConfig, TextureConfig, TissueConfig
 from jiggle_mj.scenes.scene_file import scene_from_table
 from jiggle_mj.scenes.tissue.cameras import stereo_camera
 from tests.support.tiny_scene import SCENE as TOML
@@ -27,10 +27,10 @@ from tests.support.tiny_scene import call
 EXACT = 1e-9
 SCENE = Scene(
     name="sheet",
-    tissue=Tissue(size=(0.06, 0.06), spacing=8e-3),
-    sensing=Sensing(point_sd=EXACT, image_sd=0.0),
-    camera=Camera(width=320, height=240),
-    texture=Texture(resolution=256),
+    tissue=TissueConfig(size=(0.06, 0.06), spacing=8e-3),
+    sensing=SensingConfig(point_sd=EXACT, image_sd=0.0),
+    camera=CameraConfig(width=320, height=240),
+    texture=TextureConfig(resolution=256),
 )
 CORNER = np.array([-0.028, -0.028, 4e-4])
 NEEDS = {n: cls.needs for n, cls in DISTURBANCES.items() if issubclass(cls, SensingDisturbance) and cls.needs}
@@ -300,7 +300,7 @@ def test_the_shipped_scenes_are_undisturbed():
 def test_smooth_noise_is_shared_by_neighbours_and_new_in_each_frame():
     """Over many frames the covariance of two points is smooth_sd^2 exp(-d^2 / 2 smooth_length^2)."""
     sd, length, frames = 3e-4, 0.01, 300
-    noisy = dataclasses.replace(SCENE, sensing=Sensing(point_sd=EXACT, smooth_sd=sd, smooth_length=length))
+    noisy = dataclasses.replace(SCENE, sensing=SensingConfig(point_sd=EXACT, smooth_sd=sd, smooth_length=length))
     reference = Reference(noisy, seed=0, sensing="particles")
     observer = reference._observer
     views = [observer.look() for _ in range(frames)]

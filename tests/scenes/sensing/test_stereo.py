@@ -12,7 +12,7 @@ import pytest
 from jiggle_mj.errors import RenderError
 from jiggle_mj.observation import Grasp, Move, Release, Wait
 from jiggle_mj.scenes import Reference, Scene, load_scene
-from jiggle_mj.scenes.scene.scene import Camera, Sensing, Texture
+from jiggle_mj.scenes.scene.scene import CameraConfig, SensingConfig, TextureConfig
 from jiggle_mj.scenes.sensing.stereo import StereoRenderer
 from jiggle_mj.scenes.tissue.cameras import add_cameras, stereo_camera
 from jiggle_mj.scenes.tissue.texture import bed_texture, tissue_texture
@@ -26,7 +26,8 @@ of the ball's centre, by up to f * (R/z)^2 * tan(angle) = 0.1 px at the field's 
 
 @pytest.mark.render
 @pytest.mark.parametrize(
-    "camera", [Camera(), Camera(tilt_deg=0.0, fov_deg=35.0), Camera(tilt_deg=-30.0, baseline=8e-3, width=500)]
+    "camera",
+    [CameraConfig(), CameraConfig(tilt_deg=0.0, fov_deg=35.0), CameraConfig(tilt_deg=-30.0, baseline=8e-3, width=500)],
 )
 def test_a_marker_is_drawn_where_the_calibration_projects_it(camera):
     """Centroid of a small ball = projection of its centre within 0.1 px: left u, v and disparity u_left - u_right."""
@@ -56,7 +57,9 @@ def test_a_marker_is_drawn_where_the_calibration_projects_it(camera):
 def arc() -> Scene:
     scene = load_scene("arc")
     coarse = dataclasses.replace(scene.tissue, spacing=8e-3)
-    return dataclasses.replace(scene, tissue=coarse, texture=Texture(resolution=512), sensing=Sensing(image_sd=0.0))
+    return dataclasses.replace(
+        scene, tissue=coarse, texture=TextureConfig(resolution=512), sensing=SensingConfig(image_sd=0.0)
+    )
 
 
 @pytest.mark.render
@@ -99,7 +102,7 @@ def test_image_noise_has_the_stated_sd_and_the_same_seed_gives_the_same_image(ar
 
     The tissue still creeps by 1 um a frame, which turns over a few pixels on edges: 2 % is left for them.
     """
-    noisy = dataclasses.replace(arc, sensing=Sensing(image_sd=2.0))
+    noisy = dataclasses.replace(arc, sensing=SensingConfig(image_sd=2.0))
 
     def frames(seed: int) -> list[np.ndarray]:
         with Reference(noisy, seed=seed, sensing="stereo") as reference:
@@ -153,7 +156,7 @@ def test_a_context_that_cannot_be_made_is_a_render_error(monkeypatch):
 
     monkeypatch.setattr(mujoco, "Renderer", fail)
     with pytest.raises(RenderError, match=r"No offscreen OpenGL: MUJOCO_GL=\w+ failed \(no EGL device\)"):
-        StereoRenderer(mujoco.MjModel.from_xml_string("<mujoco/>"), Camera())
+        StereoRenderer(mujoco.MjModel.from_xml_string("<mujoco/>"), CameraConfig())
 
 
 def test_mujoco_imported_too_early_is_named_as_the_cause():

@@ -14,11 +14,11 @@ from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.scenes import Reference
 from jiggle_mj.scenes.scene.attachments import Attachment, Disc, Segment
-from jiggle_mj.scenes.scene.scene import Bed, Procedure, Scene, Tissue
+from jiggle_mj.scenes.scene.scene import BedConfig, ProcedureConfig, Scene, TissueConfig
 from jiggle_mj.scenes.tissue.mesh import build_sheet
 
-TISSUE = Tissue(size=(0.06, 0.06), spacing=8e-3)
-LIGHT = Scene(name="hanging", tissue=TISSUE, bed=Bed(present=False))
+TISSUE = TissueConfig(size=(0.06, 0.06), spacing=8e-3)
+LIGHT = Scene(name="hanging", tissue=TISSUE, bed=BedConfig(present=False))
 STRIP = Segment(start=(-0.02, 0.0), end=(0.02, 0.0), width=0.01, stiffness=2.0)
 LYING = Scene(name="lying", tissue=TISSUE, attachments=(STRIP,))
 WEIGHT = TISSUE.density * TISSUE.thickness * np.prod(TISSUE.size) * 9.81
@@ -136,7 +136,7 @@ def test_a_cut_opens_welds():
 
 def test_a_suture_holds_with_slack_from_where_it_was_set():
     """It pulls along the way from its anchor, by its stiffness times what is beyond the slack."""
-    settings = Procedure(suture_slack=2e-3, suture_offset=(1e-3, 0.0, -1e-3))
+    settings = ProcedureConfig(suture_slack=2e-3, suture_offset=(1e-3, 0.0, -1e-3))
     reference = Reference(dataclasses.replace(LYING, procedure=settings), seed=0, sensing="particles")
     reference.step(Suture(path=np.array([[-0.025, -0.025]]), width=0.02, stiffness=4.0))
     corner = np.array([-0.028, -0.028, 4e-4])
@@ -159,7 +159,7 @@ def test_sewing_over_an_attachment_adds_up_and_cutting_takes_both():
 
 def test_a_failure_is_known_to_the_truth_alone(tmp_path):
     """The observation says what was intended, whether or not it came to pass."""
-    scene = dataclasses.replace(LYING, procedure=Procedure(cut_fails=0.5))
+    scene = dataclasses.replace(LYING, procedure=ProcedureConfig(cut_fails=0.5))
     cut = Cut(path=np.array([[-0.02, 0.0], [0.02, 0.0]]), width=0.012)
     outcomes = set()
     for seed in range(6):
@@ -183,7 +183,7 @@ def test_chance_leaves_the_noise_alone():
     seen = []
     for fails in (0.0, 1.0):
         reference = Reference(
-            dataclasses.replace(LYING, procedure=Procedure(cut_fails=fails)), seed=0, sensing="particles"
+            dataclasses.replace(LYING, procedure=ProcedureConfig(cut_fails=fails)), seed=0, sensing="particles"
         )
         observed = reference.step(Cut(path=np.array([[0.0, 0.0]]), width=0.1))
         assert observed.points is not None

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import equinox as eqx
 import numpy as np
 
-from .every_frame import cost, missed, weighed
+from .every_frame import cost, residual, weighed
 from .fit import Fitted
 from .linear import N_FIELDS, Metric
 from .normal_equations import less_offset
@@ -24,7 +24,7 @@ AMPLITUDES = (0.25, 1.0, 4.0, 16.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Leftover:
+class UnexplainedResidual:
     """The likeliest of those errors."""
 
     gain: float
@@ -37,7 +37,7 @@ class Leftover:
     """Of what the tool says of the held particles."""
 
 
-def leftover(problem: Problem, fitted: Fitted) -> Leftover:
+def unexplained_residual(problem: Problem, fitted: Fitted) -> UnexplainedResidual:
     """Of a fit."""
     likelihoods: dict[tuple[float, float], float] = {}
     for variance in VARIANCES:
@@ -45,7 +45,7 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
             break
         wider = problem.widened(variance, problem.amplitude)
         weights = fitted.weights if variance == 1.0 else weighed(wider, fitted.around, list(fitted.weights))
-        every = missed(wider, weights, fitted.point)
+        every = residual(wider, weights, fitted.point)
         whole = sum(float(_log_determinant(one)) for one in weights.values())
         fields = [
             np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
@@ -59,16 +59,16 @@ def leftover(problem: Problem, fitted: Fitted) -> Leftover:
     no_larger = max(likelihoods[1.0, ratio] for ratio in AMPLITUDES if ratio <= 1.0)
     gain = likelihoods[best] - no_larger
     tool, gain_of_tool = _of_tool(problem, fitted)
-    return Leftover(gain=float(gain + gain_of_tool), variance=best[0], amplitude=best[1], tool_variance=tool)
+    return UnexplainedResidual(gain=float(gain + gain_of_tool), variance=best[0], amplitude=best[1], tool_variance=tool)
 
 
 def _of_tool(problem: Problem, fitted: Fitted) -> tuple[float, float]:
     """The likeliest variance of what the tool says of the held particles, in units of the usual, and its gain [nat]."""
     squared = 0.0
-    for frames in problem.by_part(fitted.glances).values():
-        rows = np.array([np.asarray(fitted.glances[k].tool)[:, -1:] for k in frames])
+    for frames in problem.by_part(fitted.equations).values():
+        rows = np.array([np.asarray(fitted.equations[k].tool)[:, -1:] for k in frames])
         squared += float(less_offset(rows, problem.history.frames[frames[0]].frame)[0, 0])
-    degrees = 3 * len(fitted.glances)
+    degrees = 3 * len(fitted.equations)
     variance = max(squared / degrees, 1.0)
     return variance, 0.5 * (squared - squared / variance - degrees * np.log(variance))
 

@@ -29,7 +29,7 @@ PARTS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gathered:
+class Dataset:
     """All that a loop is closed over."""
 
     estimator: Estimator
@@ -43,21 +43,21 @@ class Gathered:
     """Indices of frames in which what is held is seen in another shape than when the jaws closed on it."""
 
 
-def gather(
+def collect_dataset(
     declaration: Declaration,
     camera: StereoCamera | None,
     observations: Iterable[Observation],
     *,
     config: EstimatorConfig | None = None,
     on_frame: Callable[[Observation, Estimate | None], None] = lambda observation, found: None,
-) -> Gathered:
+) -> Dataset:
     """Follow a recording.
 
     Raises:
         PerceptionError: no frame with closed jaws could be used.
     """
-    config = replace(config or EstimatorConfig(), judging="end")
-    estimator, frames, stated = Estimator(declaration, camera, config=config), [], ASSUMED_SD
+    config = replace(config or EstimatorConfig(), refinement="end")
+    estimator, frames, summary = Estimator(declaration, camera, config=config), [], ASSUMED_SD
     still: list[MeasuredPoints] = []
     standing: dict[int, list[MeasuredPoints]] = {}
     grasp, closed = -1, 0
@@ -65,7 +65,7 @@ def gather(
         found = estimator.update(observation)
         on_frame(observation, found)
         if observation.points is not None:
-            stated = observation.points.sd
+            summary = observation.points.sd
         if found is None:
             if not frames and observation.points is not None:
                 still.append(observation.points)
@@ -78,10 +78,10 @@ def gather(
     if not frames:
         raise PerceptionError("no frame with closed jaws could be used, so there is nothing to close the loop over.")
     estimator.release()
-    noise = _noise_of([still], estimator) or _noise_of(list(standing.values()), estimator) or assumed(stated)
+    noise = _noise_of([still], estimator) or _noise_of(list(standing.values()), estimator) or assumed(summary)
     fields, sd = noise.fields(estimator.sheet.rest)
     mistaken = another_shape(frames, sd, fields)
-    return Gathered(
+    return Dataset(
         estimator=estimator,
         frames=_parted([_weighed(one, sd, fields) for one in _without(frames, mistaken)]),
         noise=noise,
@@ -106,8 +106,8 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, c
             visible=jnp.asarray(visible),
             precision=jnp.zeros((len(visible), 3, 3)),
             held=jnp.asarray(hold.held),
-            loaded=jnp.asarray(estimator.loaded(hold.held)),
-            turned=jnp.asarray(hold.turned(observation.tool)),
+            force_unknown=jnp.asarray(estimator.force_unknown(hold.held)),
+            rotated=jnp.asarray(hold.rotated(observation.tool)),
             way=jnp.asarray(observation.tool.position - hold.tip),
             by_points=jnp.asarray(observation.tool.by_points),
             held_sd=jnp.zeros(()),

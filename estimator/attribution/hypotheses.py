@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..effects import Effect
-from ..parallel_map import side_by_side
+from ..parallel_map import parallel_map
 from .every_frame import cost_under
 from .fit import Fitted, fit, moved, without
-from .held_out import Foretold, foretold
-from .leftover import Leftover, leftover
+from .held_out import HeldOut, held_out
 from .problem import Point, Problem
 from .scores import Score, bayes_factor, occam, scores
+from .unexplained_residual import UnexplainedResidual, unexplained_residual
 
 LOOKED_AT = 3
 """Effects that are fitted, the likeliest by their scores."""
@@ -30,7 +30,7 @@ START = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Trial:
+class Hypothesis:
     """An effect, fitted."""
 
     score: Score
@@ -43,8 +43,8 @@ class Trial:
     sds: np.ndarray
     """Of all that are named in the fit: by its own errors, or by how far parts left out change them, whichever is
     more."""
-    left: Leftover | None = None
-    folds: list[Foretold] | None = None
+    left: UnexplainedResidual | None = None
+    folds: list[HeldOut] | None = None
 
     @property
     def theta(self) -> np.ndarray:
@@ -57,9 +57,9 @@ class Trial:
         return self.sds[np.isin(self.fitted.named, self.at)]
 
     @property
-    def missed(self) -> float:
+    def residual(self) -> float:
         """Root mean square error over all parts left out [m]; without any, the less the likelier."""
-        return Foretold.together(self.folds).rms if self.folds else -self.log_bayes_factor
+        return HeldOut.together(self.folds).rms if self.folds else -self.log_bayes_factor
 
     @property
     def sensible(self) -> bool:
@@ -68,28 +68,28 @@ class Trial:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
+class FitContext:
     """The loop before or after an effect was added."""
 
     fitted: Fitted
-    left: Leftover
-    folds: list[Foretold]
+    left: UnexplainedResidual
+    folds: list[HeldOut]
     """Each part that was fitted to, foretold by a fit without it; none if there are fewer than two."""
     scores: list[Score]
 
 
-def fitted_trials(
-    problem: Problem, stage: Stage, accepted: list[Trial], used: set[int], say: Callable[[str], None]
-) -> list[Trial]:
+def fitted_hypotheses(
+    problem: Problem, context: FitContext, accepted: list[Hypothesis], used: set[int], log: Callable[[str], None]
+) -> list[Hypothesis]:
     """The likeliest effects, fitted, the best first, as far as they are worth a look."""
-    found = scores(problem, stage.fitted)
-    stage.scores.extend(found)
-    say("scores: " + ", ".join(f"{one.name} {one.log_bayes_factor:.1f}" for one in found[:6]))
-    trials = [_fitted(problem, stage, one, accepted, used) for one in _likely(problem, found)]
-    for one in trials:
-        say(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
-    trials = [one for one in trials if one.log_bayes_factor > ENTER and np.any(one.theta != 0)]
-    return sorted(trials, key=lambda one: (not one.sensible, -one.log_bayes_factor))
+    found = scores(problem, context.fitted)
+    context.scores.extend(found)
+    log("scores: " + ", ".join(f"{one.name} {one.log_bayes_factor:.1f}" for one in found[:6]))
+    hypotheses = [_fitted(problem, context, one, accepted, used) for one in _likely(problem, found)]
+    for one in hypotheses:
+        log(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
+    hypotheses = [one for one in hypotheses if one.log_bayes_factor > ENTER and np.any(one.theta != 0)]
+    return sorted(hypotheses, key=lambda one: (not one.sensible, -one.log_bayes_factor))
 
 
 def _likely(problem: Problem, found: list[Score]) -> list[Score]:
@@ -103,42 +103,46 @@ def _likely(problem: Problem, found: list[Score]) -> list[Score]:
     return entering[:LOOKED_AT] + [one for one in near if one.name in confused]
 
 
-def judged(problem: Problem, trial: Trial, used: set[int], say: Callable[[str], None]) -> Trial:
+def refined(problem: Problem, hypothesis: Hypothesis, used: set[int], log: Callable[[str], None]) -> Hypothesis:
     """With what it leaves over and how it foretells."""
-    left = leftover(problem, trial.fitted)
-    fits = left_out(problem, trial.fitted, used)
-    folds = foretold(problem, fits)
-    thetas = [one.point.theta[trial.fitted.named] for one in fits.values()]
-    found = replace(trial, left=left, folds=folds, sds=np.maximum(trial.sds, jackknife_sd(thetas, len(trial.sds))))
-    how_well = f", foretells to {1e3 * found.missed:.2f} mm" if found.folds else ""
-    say(f"{trial.effect.name} leaves {left.gain:.1f} nat to larger errors{how_well}")
+    left = unexplained_residual(problem, hypothesis.fitted)
+    fits = left_out(problem, hypothesis.fitted, used)
+    folds = held_out(problem, fits)
+    thetas = [one.point.theta[hypothesis.fitted.named] for one in fits.values()]
+    found = replace(
+        hypothesis, left=left, folds=folds, sds=np.maximum(hypothesis.sds, jackknife_sd(thetas, len(hypothesis.sds)))
+    )
+    how_well = f", foretells to {1e3 * found.residual:.2f} mm" if found.folds else ""
+    log(f"{hypothesis.effect.name} leaves {left.gain:.1f} nat to larger errors{how_well}")
     return found
 
 
-def stated_sd(problem: Problem, trial: Trial) -> np.ndarray:
+def reported_sd(problem: Problem, hypothesis: Hypothesis) -> np.ndarray:
     """What is said of how well an effect's size is known, by its standard deviation.
 
     The model errs in part alike in all grasps, which no number of them averages away: as one of them would tell it. And
     what any sheet has of it by itself may be of either sign.
     """
     own = dict(zip(problem.own.tolist(), problem.own_sd.tolist(), strict=True))
-    alone = np.sqrt(max(len(trial.folds or []), 1)) * trial.sd
-    return np.hypot(alone, [own.get(k, 0.0) for k in trial.at.tolist()])
+    alone = np.sqrt(max(len(hypothesis.folds or []), 1)) * hypothesis.sd
+    return np.hypot(alone, [own.get(k, 0.0) for k in hypothesis.at.tolist()])
 
 
-def refitted(problem: Problem, trial: Trial, fitted: Fitted) -> Trial:
+def refitted(problem: Problem, hypothesis: Hypothesis, fitted: Fitted) -> Hypothesis:
     """The same effect by another fit; what that leaves and foretells is not known yet."""
-    return replace(trial, fitted=fitted, sds=occam(problem, fitted)[1], left=None, folds=None)
+    return replace(hypothesis, fitted=fitted, sds=occam(problem, fitted)[1], left=None, folds=None)
 
 
-def _fitted(problem: Problem, stage: Stage, score: Score, accepted: list[Trial], used: set[int]) -> Trial:
+def _fitted(
+    problem: Problem, context: FitContext, score: Score, accepted: list[Hypothesis], used: set[int]
+) -> Hypothesis:
     effect = problem.sheet.effect(score.name)
     at = problem.sheet.place(effect.name, score.site)
     named = np.concatenate([*(one.at for one in accepted), at])
-    before = stage.fitted
+    before = context.fitted
     point = _stepped(problem, before, effect, at, score) if score.began is None else score.began
     fitted = fit(problem, named.astype(int), point, used)
-    return Trial(
+    return Hypothesis(
         score=score,
         effect=effect,
         fitted=fitted,
@@ -158,7 +162,7 @@ def _stepped(problem: Problem, before: Fitted, effect: Effect, at: np.ndarray, s
 
 def left_out(problem: Problem, fitted: Fitted, used: set[int]) -> dict[int, Fitted]:
     """A fit without each part; none if there are fewer than two."""
-    return side_by_side(lambda part: without(problem, fitted, part), sorted(used) if len(used) > 1 else [])
+    return parallel_map(lambda part: without(problem, fitted, part), sorted(used) if len(used) > 1 else [])
 
 
 def jackknife_sd(thetas: list[np.ndarray], size: int) -> np.ndarray:

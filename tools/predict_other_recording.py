@@ -1,6 +1,6 @@
 """What a loop found of one recording, held against another of the same sheet: does it foretell that one better?
 
-    python tools/carry_over.py out/cloth/discrepancy.json other.mcap
+    python tools/predict_other_recording.py out/cloth/discrepancy.json other.mcap
 
 Nothing is fitted to the other recording, and nothing is attached in it. Effects that hold for one session alone (of the
 tool, the camera or the tracker) are also left out one by one.
@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jiggle_mj.estimator.attribution.gather import gather
+from jiggle_mj.estimator.attribution.dataset import collect_dataset
 from jiggle_mj.estimator.attribution.held_out import from_rest, off, rms
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects import LIBRARY
@@ -29,27 +29,27 @@ def main() -> None:
     said = parser.parse_args()
     effects = json.loads(said.discrepancy.read_text())["effects"]
     recording = Recording.open(said.recording)
-    gathered = gather(recording.declaration, recording.camera, recording)
+    dataset = collect_dataset(recording.declaration, recording.camera, recording)
     with jax.enable_x64(True):
-        problem = Problem.build(gathered, LIBRARY)
+        problem = Problem.build(dataset, LIBRARY)
         variants = {"nothing": [], "all of it": effects}
         for one in effects:
             if one["this_session_alone"]:
                 variants[f"all but {one['name']}"] = [other for other in effects if other is not one]
         for name, some in variants.items():
-            print(f"{name}: {_missed(problem, some)}", flush=True)
+            print(f"{name}: {_error_by_grasp(problem, some)}", flush=True)
 
 
-def _missed(problem: Problem, effects: list[dict[str, Any]]) -> str:
+def _error_by_grasp(problem: Problem, effects: list[dict[str, Any]]) -> str:
     frames = problem.history.frames
     theta = np.zeros(problem.sheet.size)
     for one in effects:
         theta[problem.sheet.place(one["name"], one["site"])] = one["theta"]
     states = np.stack([one.state for one in frames])
     plain = Point(theta=theta, s=np.zeros(states.shape[1]), states=states, seen=states)
-    foretold = from_rest(problem, plain, list(range(len(frames))), by_tool=True)
+    held_out = from_rest(problem, plain, list(range(len(frames))), by_tool=True)
     grasps = problem.history.by(lambda one: one.grasp, range(len(frames))).values()
-    each = [off(problem, foretold, grasp) for grasp in grasps]
+    each = [off(problem, held_out, grasp) for grasp in grasps]
     return f"{1e3 * rms(np.concatenate(each)):.1f} mm; by grasp " + ", ".join(f"{1e3 * rms(one):.1f}" for one in each)
 
 
