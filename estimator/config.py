@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from jiggle_mj.options import FilterName
+
 from .physics.surrogate import Membrane
 
-FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
-Judging = Literal["grasps", "frames", "end"]
+Refinement = Literal["grasps", "frames", "end"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,7 @@ class EstimatorConfig:
     """How well held particles follow the tip [m]."""
     grip_stiffness: float = 3.0
     """Of the springs that carry held particles with the tip while the state is searched [k]."""
-    refinement: Judging = "grasps"
+    refinement: Refinement = "grasps"
     """When the implicit filter judges noise and belief thoroughly: 'grasps', whenever the jaws open; 'end', at the end
     alone; 'frames', for a policy, which waits for the belief: at the end alone, and by a few samples after each frame,
     which takes a second or two instead of a sweep's milliseconds."""
@@ -56,8 +57,10 @@ class EstimatorConfig:
                 )
         if self.filter not in get_args(FilterName):
             raise ValueError(f"EstimatorConfig.filter must be one of {get_args(FilterName)}; got {self.filter!r}.")
-        if self.refinement not in get_args(Judging):
-            raise ValueError(f"EstimatorConfig.judging must be one of {get_args(Judging)}; got {self.refinement!r}.")
+        if self.refinement not in get_args(Refinement):
+            raise ValueError(
+                f"EstimatorConfig.refinement must be one of {get_args(Refinement)}; got {self.refinement!r}."
+            )
         if not (isinstance(self.samples, int) and self.samples >= 1):
             raise ValueError(f"EstimatorConfig.samples must be an integer of at least 1; got {self.samples}.")
         if self.membrane not in ("triangles", "edges"):

@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.material import Material, material
 from jiggle_mj.mesh_checks import check_unfolded
-from jiggle_mj.observation import Cut, Declaration, Observation, Suture, ToolState
+from jiggle_mj.observation import Declaration, Observation, ToolState
 from jiggle_mj.sheet_triangulation import SheetPlane
 
 from .belief import summaries as summaries

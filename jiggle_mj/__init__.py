@@ -21,6 +21,13 @@ if TYPE_CHECKING:
     from jiggle_mj.scenes import programme as programme
     from jiggle_mj.scenes import shipped_scenes as shipped_scenes
 
+    from .actions import Action as Action
+    from .actions import Cut as Cut
+    from .actions import Grasp as Grasp
+    from .actions import Move as Move
+    from .actions import Release as Release
+    from .actions import Suture as Suture
+    from .actions import Wait as Wait
     from .camera import CameraCalibration as CameraCalibration
     from .camera import StereoCamera as StereoCamera
     from .errors import ActionError as ActionError
@@ -40,19 +47,12 @@ if TYPE_CHECKING:
     from .estimate import Sheet as Sheet
     from .importing.folder import import_folder as import_folder
     from .material import Material as Material
-    from .observation import Action as Action
-    from .observation import Cut as Cut
     from .observation import Declaration as Declaration
     from .observation import DeclaredMesh as DeclaredMesh
-    from .observation import Grasp as Grasp
     from .observation import MeasuredPoints as MeasuredPoints
-    from .observation import Move as Move
     from .observation import Observation as Observation
-    from .observation import Release as Release
     from .observation import StereoPair as StereoPair
-    from .observation import Suture as Suture
     from .observation import ToolState as ToolState
-    from .observation import Wait as Wait
     from .recording.reader import Recording as Recording
     from .recording.reader import RecordingWriter as RecordingWriter
     from .series import RecordingSeries as RecordingSeries
@@ -114,6 +114,7 @@ __all__ = [
 ]
 
 _NAMES_OF = {
+    "actions": ("Action", "Cut", "Grasp", "Move", "Release", "Suture", "Wait"),
     "camera": ("CameraCalibration", "StereoCamera"),
     "errors": (
         "ActionError",
@@ -135,21 +136,7 @@ _NAMES_OF = {
     "eval.metrics.score": ("score",),
     "importing.folder": ("import_folder",),
     "material": ("Material",),
-    "observation": (
-        "Action",
-        "Cut",
-        "Declaration",
-        "DeclaredMesh",
-        "Grasp",
-        "MeasuredPoints",
-        "Move",
-        "Observation",
-        "Release",
-        "StereoPair",
-        "Suture",
-        "ToolState",
-        "Wait",
-    ),
+    "observation": ("Declaration", "DeclaredMesh", "MeasuredPoints", "Observation", "StereoPair", "ToolState"),
     "recording.reader": ("Recording", "RecordingWriter"),
     "series": ("RecordingSeries", "record_series"),
     "scenes": ("Reference", "Scene", "load_scene", "programme", "shipped_scenes"),

@@ -11,9 +11,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .actions import Action
 from .errors import ActionError, OutputError, PerceptionError
 from .estimate import Belief, Detection, Estimate, Sheet
-from .observation import Action, Observation
+from .observation import Observation
 from .recording.declaration import identity
 from .recording.estimate import EstimateWriter
 from .recording.mcap_files import truth_path

@@ -1,4 +1,4 @@
-"""What crosses between the tissue and the estimator: observations one way, actions the other.
+"""What crosses from the tissue to the estimator; actions, which go the other way, are in `actions`.
 
 An `Observation` is all that the estimator ever sees. World frame: z up, SI units, times in integer nanoseconds from 0.
 """
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from .actions import Cut, Suture
 from .errors import RecordingError
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
@@ -85,28 +86,6 @@ class ToolReport:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cut:
-    """Cut whatever attaches a region of the sheet."""
-
-    path: Float[np.ndarray, "m 2"]
-    """Middle line of the region, in the sheet's coordinates at rest [m]; one point for a disc."""
-    width: float
-    """Of the region, across the path and around its ends [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Suture:
-    """Attach a region of the sheet."""
-
-    path: Float[np.ndarray, "m 2"]
-    """See `Cut`."""
-    width: float
-    """See `Cut`."""
-    stiffness: float
-    """Intended for each particle of the region [N/m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Observation:
     """One moment: the tool, and images or measured points; where there are both, the estimator uses the images."""
 
@@ -177,34 +156,3 @@ class Declaration:
                 f"Declaration.poisson must be in [0, 0.5) for a shell; got {self.poisson} "
                 "(use 0.49 for nearly incompressible tissue)."
             )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Grasp:
-    """Close the jaws at a point."""
-
-    point: Float[np.ndarray, " 3"]
-    """World [m]."""
-    radius: float
-    """[m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Release:
-    """Open the jaws and let the tissue settle."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Move:
-    """Move the tip, and settle."""
-
-    to: Float[np.ndarray, " 3"]
-    """World [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wait:
-    """Observe once more without acting: a still frame."""
-
-
-Action = Grasp | Release | Move | Wait | Cut | Suture

@@ -17,8 +17,8 @@ from queue import SimpleQueue
 
 from mcap.records import Metadata
 
+from jiggle_mj.options import Sensing
 from jiggle_mj.scenes import Reference, Scene, programme
-from jiggle_mj.scenes.sensing.observer import Sensing
 
 from .cluster import died_with_its_worker
 from .episode import check_directory, clear_directory, observe, recording_identity

@@ -13,15 +13,17 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jiggle_mj.actions import Action, Cut, Grasp, Move, Release, Suture, Wait
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import ActionError, SceneError
-from jiggle_mj.observation import Action, Cut, Declaration, Grasp, Move, Observation, Release, Suture, ToolState, Wait
+from jiggle_mj.observation import Declaration, Observation, ToolState
+from jiggle_mj.options import SENSING, Sensing
 from jiggle_mj.truth import Truth, TruthFrame
 
 from .disturbances.registry import described
 from .scene.scene import Scene
 from .scene_file import scene_table
-from .sensing.observer import SENSING, Observer, Sensing
+from .sensing.observer import Observer
 from .tissue.model import TIMESTEP
 from .tissue.procedure import carry_out
 from .tissue.simulation import MAX_STEPS, Simulation

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jiggle_mj.observation import Cut, Suture
+from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.regions import distance_to_path
 
 from ..filters.implicit import SPIKE, SPREAD

@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jiggle_mj.actions import Action, Grasp, Move, Release
 from jiggle_mj.errors import ActionError
 from jiggle_mj.limits import Limits
-from jiggle_mj.observation import Action, Grasp, Move, Release
 
 from ..blas import one_thread
 from ..estimator import Estimator

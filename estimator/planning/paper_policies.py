@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jiggle_mj.actions import Action, Move
 from jiggle_mj.limits import Limits
-from jiggle_mj.observation import Action, Move
 
 from ..blas import one_thread
 from ..estimator import Estimator

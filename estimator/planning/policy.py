@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from jiggle_mj.actions import Action, Grasp, Move
 from jiggle_mj.errors import ActionError
-from jiggle_mj.observation import Action, Grasp, Move
 
 from ..estimator import Estimator
 

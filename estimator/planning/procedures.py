@@ -9,8 +9,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jiggle_mj.actions import Action, Cut, Suture
 from jiggle_mj.errors import ActionError
-from jiggle_mj.observation import Action, Cut, Suture
 from jiggle_mj.regions import distance_to_path
 
 from ..belief.topology import region_of

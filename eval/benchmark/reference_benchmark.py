@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jiggle_mj.observation import Grasp, Move, Wait
+from jiggle_mj.actions import Grasp, Move, Wait
 from jiggle_mj.scenes import Reference, Scene, load_scene, programme
 from jiggle_mj.scenes.tissue.model import TIMESTEP
 

@@ -5,6 +5,7 @@ from functools import cache, partial
 from itertools import chain, takewhile
 from typing import TYPE_CHECKING
 
+from jiggle_mj.actions import Action
 from jiggle_mj.errors import OptionError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.planning.information_policy import InformationPolicy
@@ -12,8 +13,7 @@ from jiggle_mj.estimator.planning.paper_policies import PAPER, Primitive
 from jiggle_mj.estimator.planning.policy import Policy
 from jiggle_mj.estimator.planning.procedures import Detach, ProcedurePolicy, Sew
 from jiggle_mj.estimator.planning.tool_kinematics import ToolKinematics
-from jiggle_mj.observation import Action
-from jiggle_mj.policies import POLICIES, PRIMITIVES
+from jiggle_mj.options import POLICIES, PRIMITIVES
 
 from ..metrics.score import Json
 

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jiggle_mj.actions import Grasp
 from jiggle_mj.episode import (
     ESTIMATE,
     RECORDING,
@@ -31,7 +32,7 @@ from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import Disparity, TissueMask
 from jiggle_mj.estimator.planning.policy import INTERRUPTED, Decision, Policy
 from jiggle_mj.limits import Limits
-from jiggle_mj.observation import Grasp, StereoPair
+from jiggle_mj.observation import StereoPair
 from jiggle_mj.recording.estimate import EstimateRecording, read_estimate
 from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.recording.reader import Recording
@@ -42,8 +43,8 @@ from ..report.run_page import shown_steps, write_report
 from .acting import actions, acts, check_goes_with, policy_named
 
 if TYPE_CHECKING:
+    from jiggle_mj.options import Sensing
     from jiggle_mj.scenes import Scene
-    from jiggle_mj.scenes.sensing.observer import Sensing
 
 PACKAGES = ("jiggle-mj", "mujoco", "jax", "numpy", "scipy", "opencv-python-headless")
 

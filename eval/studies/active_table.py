@@ -19,12 +19,11 @@ from plotly.subplots import make_subplots
 
 from jiggle_mj.episode import ESTIMATE, RECORDING, RESULT
 from jiggle_mj.estimator import EstimatorConfig
-from jiggle_mj.policies import PRIMITIVES, PolicyName
+from jiggle_mj.options import PRIMITIVES, PolicyName, Sensing
 from jiggle_mj.recording.estimate import EstimateRecording, read_estimate
 from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.scenes import load_scene
-from jiggle_mj.scenes.sensing.observer import Sensing
 
 from ..metrics.detection import dilate
 from ..metrics.safety import Borne, borne

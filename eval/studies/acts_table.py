@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jiggle_mj.actions import Action, Cut, Suture, Wait
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.physics.mesh import SheetMesh
 from jiggle_mj.estimator.planning.procedures import ROOM, free_stretch, tour
-from jiggle_mj.observation import Action, Cut, Suture, Wait
 from jiggle_mj.recording.declaration import is_current, made_by
 from jiggle_mj.scenes import Reference, load_scene
 from jiggle_mj.scenes.scene.programme import grasp_points, programme

@@ -13,10 +13,10 @@ import numpy as np
 
 from jiggle_mj.episode import ESTIMATE, RESULT, settings
 from jiggle_mj.estimator import EstimatorConfig
+from jiggle_mj.options import Sensing
 from jiggle_mj.recording.declaration import made_by
 from jiggle_mj.recording.estimate import read_estimate
 from jiggle_mj.scenes import load_scene
-from jiggle_mj.scenes.sensing.observer import Sensing
 
 from ..metrics.score import Json, read_result
 from ..runs.experiment import run_scene

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jiggle_mj.actions import Action, Grasp, Move, Release
 from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.filters.shots import SWEEPS, simulator
@@ -28,17 +29,7 @@ from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.equilibrium import equilibrium
 from jiggle_mj.estimator.physics.mesh import SheetMesh
 from jiggle_mj.estimator.physics.surrogate import surrogate
-from jiggle_mj.observation import (
-    Action,
-    Declaration,
-    DeclaredMesh,
-    Grasp,
-    MeasuredPoints,
-    Move,
-    Observation,
-    Release,
-    ToolState,
-)
+from jiggle_mj.observation import Declaration, DeclaredMesh, MeasuredPoints, Observation, ToolState
 from jiggle_mj.scenes import Scene, programme
 from jiggle_mj.scenes.scene.attachments import owners
 from jiggle_mj.scenes.tissue.mesh import build_sheet

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from jiggle_mj.options import Sensing
 from jiggle_mj.scenes import Scene, load_scene
 from jiggle_mj.scenes.disturbances.anchors import (
     AnchorBreak,
@@ -46,7 +47,6 @@ from jiggle_mj.scenes.disturbances.sheet import (
 from jiggle_mj.scenes.disturbances.world import BedContact, Friction, Gravity, ViscousDrag
 from jiggle_mj.scenes.scene.attachments import Attachment
 from jiggle_mj.scenes.scene.disturbance import Disturbance
-from jiggle_mj.scenes.sensing.observer import Sensing
 
 LATE = 2.2
 """When what would else be in the rest shape begins: after the still frames, before the first grasp [s]."""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from rich.table import Table
 
-from ..policies import PolicyName
-from .options import AsJson, Disturb, FilterName, Name, Out, PathArgument, Sensing
+from ..options import FilterName, PolicyName, Sensing
+from .options import AsJson, Disturb, Name, Out, PathArgument
 from .terminal import console, patient, progress, show, stop
 
 

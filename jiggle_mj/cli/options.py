@@ -5,8 +5,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-Sensing = Literal["stereo", "points", "particles", "cloud"]
-FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
 PathArgument = Annotated[Path, tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
 RowsName = Literal["inside", "together", "images", "outside", "nothing"]

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ..errors import OptionError
-from .options import AsJson, Disturb, Name, Out, PathArgument, Sensing
+from ..options import Sensing
+from .options import AsJson, Disturb, Name, Out, PathArgument
 from .terminal import bar, console, progress, stop
 
 if TYPE_CHECKING:

@@ -5,7 +5,8 @@ from typing import Annotated
 import tyro
 
 from ..errors import OptionError
-from .options import Out, RowsName, Sensing, TableName
+from ..options import Sensing
+from .options import Out, RowsName, TableName
 from .terminal import console, log
 
 

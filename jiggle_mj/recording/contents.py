@@ -18,8 +18,9 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from mcap.records import Channel, Message, Metadata, Schema
 
+from ..actions import Cut, Suture
 from ..errors import RecordingError
-from ..observation import Cut, Declaration, Suture
+from ..observation import Declaration
 from .declaration import DECLARATION, MESH, METADATA, parse_declaration, with_mesh
 from .events import parse_event
 from .frames import FrameTree

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
+from ..actions import Cut, Suture
 from ..errors import RecordingError
-from ..observation import Cut, Suture
 
 EVENT_SCHEMA: dict[str, object] = {
     "title": "jiggle_mj.Topology",

@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float
 
-from jiggle_mj.observation import Action, Grasp, Move, Release, Wait
+from jiggle_mj.actions import Action, Grasp, Move, Release, Wait
 
 from .scene import Scene
 

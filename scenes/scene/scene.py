@@ -11,7 +11,7 @@ from typing import ClassVar
 from jiggle_mj import limits
 from jiggle_mj.errors import SceneError
 from jiggle_mj.observation import Declaration
-from jiggle_mj.policies import POLICIES
+from jiggle_mj.options import POLICIES
 
 from .attachments import Attachment
 from .disturbance import Disturbance

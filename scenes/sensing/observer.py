@@ -6,7 +6,6 @@ goes with the images never changes: it is what the user believes.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, get_args
 
 import mujoco
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Float, UInt8
 
 from jiggle_mj.errors import SceneError
 from jiggle_mj.observation import MeasuredPoints, StereoPair, ToolReport
+from jiggle_mj.options import Sensing
 
 from ..scene.disturbance import SensingDisturbance
 from ..tissue.cameras import place_cameras, stereo_camera
@@ -22,8 +22,6 @@ from ..tissue.simulation import Simulation
 from . import points as sense
 from .stereo import StereoRenderer
 
-Sensing = Literal["stereo", "points", "particles", "cloud"]
-SENSING: tuple[Sensing, ...] = get_args(Sensing)
 Image = UInt8[np.ndarray, "height width 3"]
 View = tuple[StereoPair | None, MeasuredPoints | None]
 """Images, measured points."""

@@ -6,8 +6,8 @@ The region is in tissue coordinates, that of the sheet at rest. Whether it succe
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.errors import ActionError
-from jiggle_mj.observation import Cut, Suture
 from jiggle_mj.regions import distance_to_path
 
 from .simulation import Simulation

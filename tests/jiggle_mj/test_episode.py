@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Wait
 from jiggle_mj.episode import check_directory, clear_directory, estimate, observe
 from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
 from jiggle_mj.estimator import Estimator
-from jiggle_mj.observation import Declaration, Wait
+from jiggle_mj.observation import Declaration
 from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.recording.reader import Recording, RecordingWriter
 from jiggle_mj.recording.truth import read_truth

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Grasp, Move, Release, Wait
 from jiggle_mj.errors import ActionError, SceneError, SimulationError
-from jiggle_mj.observation import Grasp, Move, Release, Wait
 from jiggle_mj.scenes import Reference, Scene, programme
 from jiggle_mj.scenes.scene.attachments import Disc
 from jiggle_mj.scenes.scene.scene import BedConfig, ProgrammeConfig, TissueConfig, TweezerConfig

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.belief.attachment_belief import SITE_PRECISION, AttachmentBelief
@@ -15,7 +16,7 @@ from jiggle_mj.estimator.belief.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.belief.spike_and_slab import SpikeAndSlab
 from jiggle_mj.estimator.belief.topology import FAILS, Change, after, region_of
 from jiggle_mj.estimator.filters.implicit import COMPONENTS, DIRICHLET_STRENGTH, PARTIAL, SPIKE, SPREAD
-from jiggle_mj.observation import Cut, Declaration, MeasuredPoints, Observation, Suture, ToolState
+from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, ToolState
 
 N, REFERENCE = 12, 30.0
 REGION = np.arange(N) < 4

@@ -4,13 +4,13 @@ import equinox as eqx
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Grasp, Move, Suture
 from jiggle_mj.errors import ActionError
 from jiggle_mj.estimate import Detection, Sheet
 from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.estimator.planning.information_policy import InformationPolicy
 from jiggle_mj.estimator.planning.policy import Decision
 from jiggle_mj.estimator.planning.procedures import CERTAIN, CYCLE, Sew, free_stretch, tour
-from jiggle_mj.observation import Grasp, Move, Suture
 from tests.support.small_sheet import sheet, sheet_prior
 
 LENGTH, WIDTH = 0.02, 7e-3

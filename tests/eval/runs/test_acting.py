@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Action, Grasp, Move, Release, Wait
 from jiggle_mj.cli.terminal import patient
 from jiggle_mj.errors import ActionError, OptionError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
@@ -19,8 +20,8 @@ from jiggle_mj.estimator.planning.policy import STEP, Policy
 from jiggle_mj.eval.runs.acting import actions, check_goes_with, most_actions, policy_named
 from jiggle_mj.eval.runs.experiment import run_scene
 from jiggle_mj.limits import Limits
-from jiggle_mj.observation import Action, Declaration, Grasp, Move, Release, Wait
-from jiggle_mj.policies import POLICIES
+from jiggle_mj.observation import Declaration
+from jiggle_mj.options import POLICIES
 from jiggle_mj.scenes import Reference, load_scene, programme
 from tests.support.result_keys import KEYS, keys
 from tests.support.tiny_scene import SCENE, call, scene_file

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Grasp, Move, Release, Wait
 from jiggle_mj.errors import SceneError
-from jiggle_mj.observation import Grasp, Move, Release, Wait
 from jiggle_mj.scenes import DISTURBANCES, Reference, disturbed
 from jiggle_mj.scenes.load_tests import hold
 from jiggle_mj.scenes.scene.attachments import Disc

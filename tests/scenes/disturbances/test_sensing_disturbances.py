@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Grasp, Move, Wait
 from jiggle_mj.episode import observe
 from jiggle_mj.errors import SceneError
-from jiggle_mj.observation import Grasp, Move, Observation, StereoPair, Wait
+from jiggle_mj.observation import Observation, StereoPair
 from jiggle_mj.recording.mcap_files import iterate_records
 from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Grasp, Move, Release, Wait
 from jiggle_mj.errors import RenderError
-from jiggle_mj.observation import Grasp, Move, Release, Wait
 from jiggle_mj.scenes import Reference, Scene, load_scene
 from jiggle_mj.scenes.scene.scene import CameraConfig, SensingConfig, TextureConfig
 from jiggle_mj.scenes.sensing.stereo import StereoRenderer

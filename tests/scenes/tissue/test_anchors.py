@@ -7,9 +7,9 @@ from typing import cast
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Cut, Grasp, Move, Release, Suture, Wait
 from jiggle_mj.episode import observe
 from jiggle_mj.errors import ActionError
-from jiggle_mj.observation import Cut, Grasp, Move, Release, Suture, Wait
 from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.scenes import Reference
