@@ -10,8 +10,9 @@ import tempfile
 
 os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL") or "egl"
 os.environ["JAX_PLATFORMS"] = "cpu"
-os.environ["XLA_FLAGS"] = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+os.environ.setdefault(
+    "XLA_FLAGS",  # given, even as "", it stays: XLA_FLAGS= make test compiles as users do
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
 )
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # the first process of a run sets it, and workers inherit it
     compiled = tempfile.TemporaryDirectory()
