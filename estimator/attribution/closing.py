@@ -82,7 +82,7 @@ def close_the_loop(
         refused += more
         added = found
         stages.append(added[-1].context)
-        log(f"added by now: {', '.join(one.trial.effect.name for one in added)}")
+        log(f"added by now: {', '.join(one.hypothesis.effect.name for one in added)}")
     if len(added) > 1:
         added = revised(problem, added, used, log)
         stages.append(added[-1].context)

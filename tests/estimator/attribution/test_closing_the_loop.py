@@ -192,7 +192,7 @@ def test_a_fit_ends_before_a_point_that_cannot_be_weighed(light, monkeypatch):
     begun = closed.stages[0].fitted
     folded = dataclasses.replace(begun, cost=np.nan)
     there = iter([begun, folded])
-    monkeypatch.setattr(fitting, "_reckoned", lambda *_: next(there))
+    monkeypatch.setattr(fitting, "_linearise_at", lambda *_: next(there))
     monkeypatch.setattr(fitting, "_better", lambda *_: (begun.point, begun.cost - 1))
     monkeypatch.setattr(fitting, "_to_its_end", lambda _, ended: ended)
     assert fit(closed.problem, begun.named, begun.point, {1}) is begun
@@ -447,7 +447,7 @@ def test_a_fit_that_leads_away_and_back_is_taken_where_it_cost_least(monkeypatch
         object.__setattr__(point, "cost", float(cost))
     reckoned = iter(points)
     monkeypatch.setattr(Problem, "frames", lambda self, parts: [])
-    monkeypatch.setattr(fitting, "_reckoned", lambda *_: next(reckoned))
+    monkeypatch.setattr(fitting, "_linearise_at", lambda *_: next(reckoned))
     monkeypatch.setattr(fitting, "_steps", lambda *_: [])
     monkeypatch.setattr(fitting, "_better", lambda problem, now, steps: (object.__new__(Point), now.cost - 5))
     monkeypatch.setattr(fitting, "_to_its_end", lambda problem, now: now)

@@ -196,7 +196,7 @@ def test_a_turned_way_is_as_long(plain, moment):
         ({"name": "a name"}, "letters, digits and underscores; got 'a name'"),
         ({"units": ("m", "m")}, "one entry for each parameter; got 2 and 1"),
         ({"prior_sd": (0.0,)}, "prior_sd must be above 0"),
-        ({"natural": ((1.0, 2.0),)}, "each start in natural needs 1 parameters"),
+        ({"initial_guesses": ((1.0, 2.0),)}, "each of initial_guesses needs 1 parameters"),
     ],
 )
 def test_a_users_effect_is_checked(changed, says):

@@ -122,6 +122,6 @@ def test_a_frame_without_a_state_is_said_to_be_so_and_forgotten(make):
 
 @pytest.mark.parametrize("make", [explicit, adam, unscented])
 def test_filters_that_simulate_need_the_step_that_led_to_the_frame(make):
-    bare = Evidence(**{name: getattr(frame(1), name) for name in ("y", "precision", "held", "loaded")})
+    bare = Evidence(**{name: getattr(frame(1), name) for name in ("y", "precision", "held", "force_unknown")})
     with pytest.raises(ValueError, match=r"needs Evidence\.pull"):
         run(make(), [bare])

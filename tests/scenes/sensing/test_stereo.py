@@ -132,7 +132,7 @@ def test_a_machine_without_opengl_still_simulates_and_says_what_to_install(tmp_p
     code = """
 import dataclasses
 from jiggle_mj.errors import RenderError
-from jiggle_mj.observation import Wait
+from jiggle_mj.actions import Wait
 from jiggle_mj.scenes import Reference, Scene
 from jiggle_mj.scenes.scene.scene import Tissue
 scene = Scene(name="small", tissue=Tissue(size=(0.04, 0.04), spacing=8e-3))
