@@ -74,14 +74,14 @@ def known_options(verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 
 def documented(page: str) -> dict[str, dict[str, tuple[str, str]]]:
     """Map section, or shape of an attachment, to key to (default, allowed), from the tables of docs/SCENES.md."""
-    found: dict[str, dict[str, tuple[str, str]]] = {}
+    tables: dict[str, dict[str, tuple[str, str]]] = {}
     for part in re.split(r"^(?=##+ )", page, flags=re.MULTILINE)[1:]:
         heading = part.partition("\n")[0]
         named = re.search(r'`(?:\[+|shape = ")(\w+)["\]]', heading)
         rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|", part, re.MULTILINE)
         if named:
-            found[named[1]] = {key: (default, allowed) for key, default, allowed in rows}
-    return found
+            tables[named[1]] = {key: (default, allowed) for key, default, allowed in rows}
+    return tables
 
 
 def own(section: type[Section]) -> list[Field[Any]]:
@@ -192,8 +192,8 @@ def test_scenes_md_states_each_default_and_range(name: str):
         if field.default is MISSING:
             assert default == "needed", field.name
         else:
-            stated = tomllib.loads(f"it = {default.strip('`')}")["it"]
-            assert checked(field, stated, where=name) == field.default, field.name
+            documented_default = tomllib.loads(f"it = {default.strip('`')}")["it"]
+            assert checked(field, documented_default, where=name) == field.default, field.name
 
 
 @pytest.mark.parametrize("name", DISTURBANCES)
@@ -201,10 +201,10 @@ def test_disturbances_md_states_each_default_and_range(name: str):
     """One row for the magnitude, one for each further key; `start` is the same for all."""
     page = (ROOT / "docs" / "DISTURBANCES.md").read_text(encoding="utf-8")
     rows = re.findall(rf"^\| `{name}(\.\w+)?` \| `(.*?)` \| (.*?) \|", page, re.MULTILINE)
-    stated = {key.removeprefix(".") or "magnitude": (default, allowed) for key, default, allowed in rows}
+    documented_keys = {key.removeprefix(".") or "magnitude": (default, allowed) for key, default, allowed in rows}
     known = {f.name: f for f in fields(DISTURBANCES[name]) if f.name != "start"}
-    assert set(stated) == set(known)
-    for key, (default, allowed) in stated.items():
+    assert set(documented_keys) == set(known)
+    for key, (default, allowed) in documented_keys.items():
         assert allowed == refusal(DISTURBANCES[name], key), key
         assert checked(known[key], tomllib.loads(f"it = {default}")["it"], where=name) == known[key].default, key
 
