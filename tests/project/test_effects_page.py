@@ -21,5 +21,5 @@ def test_the_page_lists_the_library():
 
 
 def test_effects_have_the_names_of_the_disturbances_that_cause_them():
-    """But what swings, that is `inertia` of a sheet that hangs, and those of the scenes lie; and what any sheet has."""
+    """Two have none: `swing`, since the sheets of the scenes lie, and `surface_height`, which any sheet has."""
     assert {effect.name for effect in LIBRARY} - {"swing", "surface_height"} <= set(DISTURBANCES)

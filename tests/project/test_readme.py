@@ -1,4 +1,4 @@
-"""What README.md and docs/ say is so: the example runs, and every verb, option, scene, key, default and link exists."""
+"""What README.md and docs/ say is true: the example runs; each verb, option, scene, key, default and link exists."""
 
 import re
 import subprocess
@@ -23,12 +23,16 @@ from jiggle_mj.scenes.scene_file import SECTIONS, scene_from_table
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+USAGE = (ROOT / "docs" / "USAGE.md").read_text(encoding="utf-8")
+METHOD = (ROOT / "docs" / "METHOD.md").read_text(encoding="utf-8")
 RESULTS = (ROOT / "docs" / "RESULTS.md").read_text(encoding="utf-8")
+STUDIES = (ROOT / "docs" / "STUDIES.md").read_text(encoding="utf-8")
 SCENES = (ROOT / "docs" / "SCENES.md").read_text(encoding="utf-8")
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+GLOSSARY = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
 
 TABLES: dict[str, type[Section]] = {**SECTIONS, "attachments": Attachment, **SHAPES}
-"""What docs/SCENES.md has a table for."""
+"""The tables of docs/SCENES.md."""
 RIGHT_AT_LEAST = 0.6
 """Precision and recall of the example, exact and on a mesh of its own; docs/RESULTS.md has the bar for exact scores."""
 RUN_AND_KEEP = """
@@ -36,27 +40,31 @@ import runpy, numpy
 names = runpy.run_path("example.py")
 numpy.savez("kept.npz", rest=names["estimator"].sheet.rest, reported=names["detection"].attached)
 """
-"""Runs the example, and keeps what it found for a look that the example does not take."""
+"""Program that runs the example, and saves what it found for checks that the example does not make."""
 OPTION = r"(?<![\w-])--[a-z][a-z-]*"
 """A long option, not a dash in a table."""
 LARGEST_PICTURE = 300_000
-"""Bytes; a README that loads slowly is not read."""
+"""Largest size of a picture [bytes]; a README that loads slowly is not read."""
+LONGEST_README, LONGEST_RESULTS = 150, 300
+"""Largest numbers of lines: a front page is read at once, and the results have one current figure for each claim."""
+COMMIT_HASH = r"\b(?=[0-9a-f]*[0-9])(?=[0-9a-f]*[a-f])[0-9a-f]{7}\b"
+"""A short commit hash; current pages have none, since history is in docs/notebook/."""
 
 
 def blocks(page: str, language: str) -> list[str]:
-    """Fenced blocks of one language."""
+    """Return the fenced blocks of one language."""
     return re.findall(rf"^```{language}\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
 
 
 def commands(page: str) -> Iterator[tuple[str, list[str]]]:
-    """Verb and options of each `jiggle-mj VERB ...` in code, fenced or between backquotes."""
+    """Yield verb and options of each `jiggle-mj VERB ...` in code, fenced or between backquotes."""
     code = "\n".join(re.findall(r"```.*?```|`[^`\n]+`", page, re.DOTALL))
     for verb, rest in re.findall(r"\bjiggle-mj ([a-z-]+)([^`#\n]*)", code):
         yield verb, re.findall(OPTION, rest)
 
 
 def known_options(verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> set[str]:
-    """Those that the verb's own help lists."""
+    """Return the options that the verb's own help lists."""
     monkeypatch.setattr(sys, "argv", ["jiggle-mj", verb, "--help"])
     with pytest.raises(SystemExit) as stopped:
         cli.main()
@@ -65,38 +73,45 @@ def known_options(verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 
 
 def documented(page: str) -> dict[str, dict[str, tuple[str, str]]]:
-    """Section, or shape of an attachment, to key to (default, allowed), from the tables of docs/SCENES.md."""
-    found: dict[str, dict[str, tuple[str, str]]] = {}
+    """Map section, or shape of an attachment, to key to (default, allowed), from the tables of docs/SCENES.md."""
+    tables: dict[str, dict[str, tuple[str, str]]] = {}
     for part in re.split(r"^(?=##+ )", page, flags=re.MULTILINE)[1:]:
         heading = part.partition("\n")[0]
         named = re.search(r'`(?:\[+|shape = ")(\w+)["\]]', heading)
         rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|", part, re.MULTILINE)
         if named:
-            found[named[1]] = {key: (default, allowed) for key, default, allowed in rows}
-    return found
+            tables[named[1]] = {key: (default, allowed) for key, default, allowed in rows}
+    return tables
 
 
 def own(section: type[Section]) -> list[Field[Any]]:
-    """The fields of a table; a shape's are those that not every shape has."""
+    """Return the fields of a table; a shape's are those that not every shape has."""
     shared = {f.name for f in fields(Attachment)} if section in SHAPES.values() else set()
     return [f for f in fields(section) if f.name not in shared]
 
 
 def refusal(section: type[Section], key: str) -> str:
-    """What a section says is allowed, when it is given nothing of the kind."""
+    """Return what a section says is allowed, when it is given a value of a wrong type."""
     field = next(f for f in fields(section) if f.name == key)
     with pytest.raises(SceneError) as refused:
         checked(field, None, where="it")
     return str(refused.value).partition("must be ")[2].removesuffix(".")
 
 
+def anchors(page: str) -> set[str]:
+    """Return the anchors that GitHub gives the headings of a page."""
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
+    texts = [re.sub(r"\[(.*?)\]\(.*?\)", r"\1", heading) for heading in headings]
+    return {re.sub(r"[^\w\- ]", "", text).strip().lower().replace(" ", "-") for text in texts}
+
+
 def test_the_readme_example_finds_the_attachments(tmp_path: Path):
-    """The README's Python, as it stands, on the README's scene: right by at least `RIGHT_AT_LEAST`, both ways.
+    """The README's Python, as it stands, on the scene of docs/USAGE.md has both scores of `RIGHT_AT_LEAST` or more.
 
     Runs in an interpreter of its own, with none of the tests' settings. A particle is truly attached when a shape of
     the scene file reaches it at rest.
     """
-    (scene,), (example,) = blocks(README, "toml"), blocks(README, "python")
+    (scene,), (example,) = blocks(USAGE, "toml"), blocks(README, "python")
     (tmp_path / "scene.toml").write_text(scene, encoding="utf-8")
     (tmp_path / "example.py").write_text(example, encoding="utf-8")
     command = [sys.executable, "-W", "error", "-c", RUN_AND_KEEP]
@@ -121,26 +136,41 @@ def test_every_command_in_the_pages_exists(
         assert set(options) <= known_options(verb, monkeypatch, capsys), verb
 
 
-def test_the_readme_shows_every_verb():
-    assert {verb for verb, _ in commands(README)} == set(cli.VERBS)
+def test_the_readme_is_short_and_links_every_page():
+    assert len(README.splitlines()) <= LONGEST_README
+    pages = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
+    assert pages <= set(re.findall(r"\]\(([^)#]+)", README))
 
 
-def test_every_option_that_readme_and_results_name_exists(
+def test_the_results_have_one_current_figure_for_each_claim():
+    """No commit hash stands in a page outside docs/notebook/."""
+    assert len(RESULTS.splitlines()) <= LONGEST_RESULTS
+    current = [path for path in PAGES if path.parent.name != "notebook"]
+    assert {path.name: re.findall(COMMIT_HASH, path.read_text(encoding="utf-8")) for path in current} == {
+        path.name: [] for path in current
+    }
+
+
+def test_the_usage_page_shows_every_verb():
+    assert {verb for verb, _ in commands(USAGE)} == set(cli.VERBS)
+
+
+def test_every_option_that_readme_usage_and_results_name_exists(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """Also those that are named apart from a command."""
     known = set().union(*(known_options(verb, monkeypatch, capsys) for verb in cli.VERBS))
-    assert set(re.findall(OPTION, README + RESULTS)) <= known
+    assert set(re.findall(OPTION, README + USAGE + METHOD + RESULTS + STUDIES)) <= known
 
 
-def test_every_shipped_scene_is_in_the_readme():
+def test_every_shipped_scene_is_in_the_usage_page():
     """The list behind "Shipped:" names each scene, and no other."""
-    listed = re.search(r"Shipped: (.*?)\n\n", README, re.DOTALL)
+    listed = re.search(r"Shipped: (.*?)\. \[k\]", USAGE, re.DOTALL)
     assert listed and set(re.findall(r"`(\w+)`", listed[1])) == set(shipped_scenes())
 
 
-def test_the_readme_states_the_detection_rule():
-    assert f"The rule is {RULE}" in README
+def test_the_method_page_states_the_detection_rule():
+    assert f"The rule is {RULE}" in METHOD
 
 
 def test_scenes_md_names_exactly_the_sections_and_keys():
@@ -162,8 +192,8 @@ def test_scenes_md_states_each_default_and_range(name: str):
         if field.default is MISSING:
             assert default == "needed", field.name
         else:
-            stated = tomllib.loads(f"it = {default.strip('`')}")["it"]
-            assert checked(field, stated, where=name) == field.default, field.name
+            documented_default = tomllib.loads(f"it = {default.strip('`')}")["it"]
+            assert checked(field, documented_default, where=name) == field.default, field.name
 
 
 @pytest.mark.parametrize("name", DISTURBANCES)
@@ -171,10 +201,10 @@ def test_disturbances_md_states_each_default_and_range(name: str):
     """One row for the magnitude, one for each further key; `start` is the same for all."""
     page = (ROOT / "docs" / "DISTURBANCES.md").read_text(encoding="utf-8")
     rows = re.findall(rf"^\| `{name}(\.\w+)?` \| `(.*?)` \| (.*?) \|", page, re.MULTILINE)
-    stated = {key.removeprefix(".") or "magnitude": (default, allowed) for key, default, allowed in rows}
+    documented_keys = {key.removeprefix(".") or "magnitude": (default, allowed) for key, default, allowed in rows}
     known = {f.name: f for f in fields(DISTURBANCES[name]) if f.name != "start"}
-    assert set(stated) == set(known)
-    for key, (default, allowed) in stated.items():
+    assert set(documented_keys) == set(known)
+    for key, (default, allowed) in documented_keys.items():
         assert allowed == refusal(DISTURBANCES[name], key), key
         assert checked(known[key], tomllib.loads(f"it = {default}")["it"], where=name) == known[key].default, key
 
@@ -194,6 +224,33 @@ def test_the_worked_example_of_scenes_md_is_a_scene_and_declares_its_own_tissue(
 def test_every_link_within_the_project_leads_somewhere(path: Path):
     links = re.findall(r"\]\((?!https?://)([^)#]+)", path.read_text(encoding="utf-8"))
     assert [link for link in links if not (path.parent / link).is_file()] == []
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_every_anchor_within_the_project_is_a_heading(path: Path):
+    links = re.findall(r"\]\((?!https?://)([^)#]*)#([^)]+)\)", path.read_text(encoding="utf-8"))
+    pages = {page: (path.parent / page if page else path).read_text(encoding="utf-8") for page, _ in links}
+    assert [(page, anchor) for page, anchor in links if anchor not in anchors(pages[page])] == []
+
+
+def test_every_page_links_the_glossary():
+    pages = [path for path in (ROOT / "docs").glob("*.md") if path.name != "glossary.md"]
+    assert [path.name for path in [ROOT / "README.md", *pages] if "glossary.md" not in path.read_text("utf-8")] == []
+
+
+def test_every_test_and_file_that_paper_md_names_exists():
+    page = (ROOT / "docs" / "PAPER.md").read_text(encoding="utf-8")
+    known = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")}
+    tests = re.findall(r"`(test_\w+\.py)::(test_\w+)`", page)
+    assert tests
+    assert [name for file, name in tests if f"def {name}(" not in known.get(file, "")] == []
+    files = set(re.findall(r"`((?:estimator|eval|jiggle_mj|scenes)/[\w/]+\.py)`", page))
+    assert {file for file in files if not (ROOT / file).is_file()} == set()
+
+
+def test_the_glossary_has_each_term_once():
+    terms = re.findall(r"^### (.*)$", GLOSSARY, re.MULTILINE)
+    assert len(terms) == len(set(terms))
 
 
 def test_pictures_are_small():
