@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.filters.implicit import PROBABILITY
+from jiggle_mj.estimator.belief.prior import PriorConfig
 from jiggle_mj.estimator.physics.energy import SheetEnergy
 from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.surrogate import surrogate
@@ -84,7 +84,7 @@ def test_the_hold_is_suspected_where_nothing_is_seen_and_nowhere_else(folder, tm
     assert x.min() < LEFT + 2e-3 and summary.n_held > 0
     assert not np.isfinite(found.estimates[-1].observed[x < VIEW - 1e-3]).any()
     seen = (x > VIEW + 3 * 4e-3) & ~found.estimates[-1].held
-    assert not found.detection.attached[seen].any() and probability[seen].mean() < PROBABILITY
+    assert not found.detection.attached[seen].any() and probability[seen].mean() < PriorConfig().probability
     assert probability[x < VIEW].mean() > 4 * probability[seen].mean()
     assert probability[x < VIEW].sum() > 2.5
     assert summary.truth is not None and summary.n_attached

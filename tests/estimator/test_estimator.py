@@ -10,8 +10,8 @@ import trimesh
 from jiggle_mj.errors import MeshError, PerceptionError, RecordingError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
-from jiggle_mj.estimator.filters.evidence import PosteriorSummary
 from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
+from jiggle_mj.estimator.filters.posterior_summary import Convergence, PosteriorSummary
 from jiggle_mj.estimator.perception import Track
 from jiggle_mj.observation import DeclaredMesh, MeasuredPoints, Observation, StereoPair, ToolState
 from tests.support.perception_plane import camera
@@ -327,9 +327,15 @@ def test_a_belief_that_is_no_number_when_the_jaws_open_is_refused_and_the_last_o
     for one in frames[:4]:
         estimator.update(one)
     before, none = estimator.detection, jnp.full(sheet().n, jnp.nan)
-    belief, no, yes = BoundaryBelief.prior(sheet().n, mean=0.0, sd=1.0), jnp.asarray(jnp.nan), jnp.asarray(True)
-    spoilt = PosteriorSummary(belief=belief, b=none, sd=none, probability=none, entropy=no, converged=yes)
-    monkeypatch.setattr(NonNegativeLeastSquares, "release", lambda self, belief, thorough: spoilt)
+    spoilt = PosteriorSummary(
+        belief=BoundaryBelief.prior(sheet().n, mean=0.0, sd=1.0),
+        b=none,
+        sd=none,
+        probability=none,
+        entropy=none[0],
+        convergence=Convergence.CONVERGED.code,
+    )
+    monkeypatch.setattr(NonNegativeLeastSquares, "release", lambda self, state, thorough: (state, spoilt))
     with pytest.raises(PerceptionError, match="leave no finite belief"):
         estimator.release()
     opened = dataclasses.replace(frames[4], tool=dataclasses.replace(frames[4].tool, closed=False))
@@ -340,7 +346,26 @@ def test_a_belief_that_is_no_number_when_the_jaws_open_is_refused_and_the_last_o
         estimator.identify()
 
 
-@pytest.mark.parametrize("ask", ["belief", "detection"])
+@pytest.mark.parametrize("change", [{"seed": -1}, {"seed": 0.5}])
+def test_a_seed_must_be_a_whole_number(change):
+    with pytest.raises(ValueError, match=r"EstimatorConfig\.seed must be an integer of at least 0"):
+        EstimatorConfig(**change)
+
+
+def test_another_seed_draws_other_samples_and_the_same_seed_the_same():
+    """Samples are drawn when the jaws open."""
+    found = []
+    for seed in (0, 0, 1):
+        estimator = Estimator(DECLARATION, config=dataclasses.replace(CONFIG, seed=seed))
+        for one in episode()[:6]:
+            estimator.update(one)
+        estimator.release()
+        found.append(np.asarray(estimator.detection.score))
+    np.testing.assert_array_equal(found[0], found[1])
+    assert not np.array_equal(found[0], found[2])
+
+
+@pytest.mark.parametrize("ask", ["belief", "detection", "balance", "attachment_belief", "point_precision"])
 def test_asking_for_results_before_the_first_grasp_is_refused_in_words(ask):
     with pytest.raises(ValueError, match="not known before the first frame with closed jaws"):
         getattr(Estimator(DECLARATION), ask)

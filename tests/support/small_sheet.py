@@ -4,15 +4,19 @@ from dataclasses import dataclass
 from functools import cache
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jiggle_mj.estimate import Belief
 from jiggle_mj.estimator.belief.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.belief.prior import prior_belief
 from jiggle_mj.estimator.effects.sheet_model import FrameContext, SheetModel, centred, nominal_energy
-from jiggle_mj.estimator.filters.evidence import Evidence, PosteriorSummary, Update
-from jiggle_mj.estimator.filters.force_balance import LEAST, ForceBalance
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
+from jiggle_mj.estimator.filters.config import FilterConfig
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter, ImplicitState
+from jiggle_mj.estimator.filters.posterior_summary import PosteriorSummary, Update
 from jiggle_mj.estimator.physics.block_tridiagonal import BlockTridiagonal, Layout
 from jiggle_mj.estimator.physics.energy import SheetEnergy
 from jiggle_mj.estimator.physics.environment import Grip
@@ -95,7 +99,7 @@ def sheet_balance(force_sd: float, force_level: float = np.inf) -> ForceBalance:
         sheet(),
         sheet_energy(),
         reference=k,
-        force_sd=force_sd / LEAST,
+        force_sd=force_sd / FilterConfig().force_sd_floor,
         force_level=force_level,
         anchor_sd=1e-4,
         grip_stiffness=3 * k,
@@ -177,19 +181,25 @@ def lifts(stiffness: float = STIFFNESS) -> tuple[Lift, ...]:
     return tuple(frames)
 
 
-def follow(filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence]) -> tuple[Update, PosteriorSummary]:
-    """All frames, the jaws opening after each lift; the last update, and what is stated at the end."""
-    belief, b, grasp, update = sheet_prior(), jnp.zeros(sheet().n), 1, None
-    for frame, one in zip(frames, seen, strict=True):
+def sheet_filter(force_sd: float, *, learns_noise: bool = True) -> ImplicitFilter:
+    """Return the implicit filter for this sheet; the force error holds everywhere [N]."""
+    return ImplicitFilter(declared_balance=sheet_balance(force_sd), prior=sheet_prior(), learns_noise=learns_noise)
+
+
+def follow(
+    filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence]
+) -> tuple[ImplicitState, Update, PosteriorSummary]:
+    """Take all frames, with the jaws opening after each lift; return state, last update and posterior."""
+    state, grasp, update = filter.init(jax.random.key(0)), 1, None
+    for frame, evidence in zip(frames, seen, strict=True):
         if frame.grasp != grasp:
-            summary = filter.release(belief)
+            state, summary = filter.release(state)
             assert summary is not None
-            belief, b, grasp = summary.belief, summary.b, frame.grasp
-        update = filter.update(belief, b, one, one.y)
-        belief, b = update.belief, update.b
-    summary = filter.release(belief)
+            grasp = frame.grasp
+        state, update = filter.update(state, evidence, evidence.y)
+    state, summary = filter.release(state)
     assert update is not None and summary is not None
-    return update, summary
+    return state, update, summary
 
 
 def nees(belief: AttachmentBelief) -> float:

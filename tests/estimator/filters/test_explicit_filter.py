@@ -128,11 +128,13 @@ def test_the_latest_sample_is_always_drawn_and_none_from_before_the_cut():
     assert set(np.concatenate(drawn).tolist()) == {0, 1, 2, 3, 4, 5}
     assert draw_samples(0, 3, np.random.default_rng(0)).tolist() == [0]
 
-    history = ShotHistory(grip_stiffness=90.0, samples=3)
+    history = ShotHistory.empty(jax.random.key(0))
     for height in (1.0, 2.0, 3.0):
-        history.add(step(height))
-    history.forget()
-    after = [history.add(step(height)) for height in (4.0, 5.0)]
+        history, _ = history.with_step(step(height), grip_stiffness=90.0).draw(3)
+    history, after = history.forgotten(), []
+    for height in (4.0, 5.0):
+        history, drawn = history.with_step(step(height), grip_stiffness=90.0).draw(3)
+        after.append(drawn)
     heights = [np.asarray(one.tip)[np.asarray(one.precision).any(axis=(1, 2, 3)), 2].tolist() for one in after]
     assert heights == [[4.0], [4.0, 5.0]]
 

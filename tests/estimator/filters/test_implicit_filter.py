@@ -1,14 +1,19 @@
 """The implicit filter on its own engine: attachments from soft to welded, honest uncertainty, missing particles."""
 
+import copy
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jiggle_mj.estimator.filters.config import FilterConfig
 from jiggle_mj.estimator.filters.evidence import Evidence
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter, ImplicitState
+from jiggle_mj.estimator.filters.posterior_summary import Convergence
 from jiggle_mj.eval.metrics.detection import dilate
 from tests.support.small_sheet import (
     STIFFNESS,
@@ -19,8 +24,7 @@ from tests.support.small_sheet import (
     nees,
     observed,
     sheet,
-    sheet_balance,
-    sheet_prior,
+    sheet_filter,
 )
 
 FORCE_SD = 1e-4
@@ -31,12 +35,19 @@ SEEDS = range(3)
 
 
 def implicit() -> ImplicitFilter:
-    return ImplicitFilter(sheet_balance(FORCE_SD))
+    return sheet_filter(FORCE_SD)
+
+
+def before_any_frame(filter: ImplicitFilter, b: np.ndarray | None = None) -> ImplicitState:
+    """Return the state before the first frame, with other stiffnesses to linearise at [N/m]."""
+    state = filter.init(jax.random.key(0))
+    return state if b is None else replace(state, summary=replace(state.summary, b=jnp.asarray(b)))
 
 
 def run(frames: tuple[Lift, ...], seed: int):
-    """All lifts; the last update, and what is stated at the end."""
-    return follow(implicit(), frames, [observed(frame, 100 * seed + k) for k, frame in enumerate(frames)])
+    """Return the last update over all lifts, and the posterior at the end."""
+    _, update, summary = follow(implicit(), frames, [observed(frame, 100 * seed + k) for k, frame in enumerate(frames)])
+    return update, summary
 
 
 @cache
@@ -97,7 +108,7 @@ def test_the_state_is_closer_to_the_truth_than_what_was_seen():
     """The sheet's physics filters the noise."""
     frame, filter = lifts()[3], implicit()
     seen = observed(frame, 5)
-    out = filter.update(sheet_prior(), jnp.asarray(STIFFNESS * attached()), seen, seen.y)
+    _, out = filter.update(before_any_frame(filter, STIFFNESS * attached()), seen, seen.y)
     free = ~frame.held
     rms = [np.sqrt(np.mean((np.asarray(x) - frame.x)[free] ** 2)) for x in (out.x, seen.y)]
     assert rms[0] < 0.8 * rms[1]
@@ -118,7 +129,7 @@ def test_a_missing_particle_has_no_influence():
     outs = []
     for one in (seen, other):
         filter = implicit()
-        outs.append(filter.update(sheet_prior(), jnp.zeros(sheet().n), one, jnp.asarray(frame.x)))
+        outs.append(filter.update(before_any_frame(filter), one, jnp.asarray(frame.x))[1])
     for name in ("x", "b", "nis", "probability"):
         np.testing.assert_array_equal(getattr(outs[0], name), getattr(outs[1], name))
 
@@ -126,6 +137,33 @@ def test_a_missing_particle_has_no_influence():
 def test_a_release_without_a_frame_since_the_last_changes_nothing():
     frame, filter = lifts()[3], implicit()
     seen = observed(frame, 5)
-    out = filter.update(sheet_prior(), jnp.zeros(sheet().n), seen, seen.y)
-    summary = filter.release(out.belief)
-    assert filter.release(summary.belief) is None
+    state, _ = filter.update(before_any_frame(filter), seen, seen.y)
+    state, summary = filter.release(state)
+    assert summary is not None
+    again, nothing = filter.release(state)
+    assert nothing is None and again is state
+
+
+def test_the_reason_says_whether_the_search_was_cut_off():
+    """From what was seen, crumpled by its noise, the search takes several steps; one is not enough."""
+    frame, filter = lifts()[3], implicit()
+    short = replace(filter.declared_balance, config=FilterConfig(max_state_steps=1, smooth_force=1e9))
+    reasons = []
+    for one in (filter, replace(filter, declared_balance=short)):
+        _, out = one.update(before_any_frame(one), observed(frame, 3), observed(frame, 3).y)
+        reasons.append(out.reason)
+        assert bool(out.converged) == (out.reason is Convergence.CONVERGED)
+    assert reasons == [Convergence.CONVERGED, Convergence.SEARCH_CUT_OFF]
+
+
+def test_the_state_is_a_pytree_that_an_update_leaves_alone():
+    """A copy of a state gives the same bytes as the state, and neither is changed by an update."""
+    filter, frames = implicit(), lifts()[2:4]
+    first = before_any_frame(filter)
+    state, _ = filter.update(first, observed(frames[0], 1), observed(frames[0], 1).y)
+    assert first.grasps == () and len(state.grasps) == 1
+    copied = copy.deepcopy(state)
+    assert jax.tree.structure(copied) == jax.tree.structure(state)
+    outs = [filter.update(one, observed(frames[1], 2), observed(frames[1], 2).y)[1] for one in (state, copied, state)]
+    assert len({np.asarray(out.b).tobytes() for out in outs}) == 1
+    assert len(state.grasps[0].frames) == 1
