@@ -7,8 +7,6 @@ camera's calibration and the declaration.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,45 +18,25 @@ from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.material import Material, material
-from jiggle_mj.mesh_checks import check_unfolded
 from jiggle_mj.observation import Declaration, Observation, ToolState
-from jiggle_mj.sheet_triangulation import SheetPlane
 
 from . import summaries
 from .belief.attachment_belief import AttachmentBelief
 from .belief.topology import Change, region_of
 from .blas import one_thread
 from .config import EstimatorConfig
-from .filters.build import build_filter
-from .filters.filter import Filter, FilterState
+from .filters.filter import FilterState
 from .filters.force_balance import ForceBalance
 from .filters.posterior_summary import Convergence, PosteriorSummary
 from .fusion import fill_unseen, fuse, pull
 from .grip import GripHold, GripTracker
 from .identification import identify
 from .perception import Believed, Disparity, Perception, TissueMask, Track
-from .perception.mesh_field import MeshField
 from .physics.environment import Grip
-from .physics.mesh import SheetMesh
+from .tracked_sheet import TrackedSheet
 
 INITIAL_POINT_SD = 3e-4
 """Standard deviation of a seen coordinate until the first frame with closed jaws has shown it [m]."""
-
-
-@dataclass(kw_only=True)
-class _Model:
-    """What is built once the rest shape is known, and the filter's state."""
-
-    filter: Filter[Any]
-    field: MeshField
-    """Fills unseen particles from their surroundings."""
-    prior_entropy: float
-    """Entropy of the belief before the first frame [nat]."""
-    state: FilterState
-    x: Float[np.ndarray, "n 3"]
-    """Positions after the latest frame with closed jaws [m]."""
-    resting: Float[np.ndarray, "n 3"]
-    """Positions with open jaws, as last asked for [m]."""
 
 
 class Estimator:
@@ -76,7 +54,7 @@ class Estimator:
         """Take what is known before the first frame.
 
         Args:
-            declaration: what the user says of the tissue.
+            declaration: the tissue as the user declares it.
             camera: needed for observations with images.
             config: settings; the defaults are those that the figures of docs/RESULTS.md were made with.
             mask: which pixels are tissue; by colour if None.
@@ -87,7 +65,7 @@ class Estimator:
         """Index and reason of each observation that could not be used."""
         self._perception = Perception(declaration, camera, spacing=self.config.spacing, mask=mask, disparity=disparity)
         self._grip = GripTracker()
-        self._model: _Model | None = None
+        self._sheet: TrackedSheet | None = None
         self._open_frame: Observation | None = None
         self._tool: ToolState | None = None
         self._seen_precision = np.eye(3) * INITIAL_POINT_SD**-2
@@ -116,7 +94,7 @@ class Estimator:
     def _update(self, observation: Observation) -> Estimate | None:
         """Prepare the grasp of a frame, then run it through perception, grip, fusion and filter."""
         tool = self._tool = observation.tool
-        if self._model is None:
+        if self._sheet is None:
             if (passed_over := self._perception.look_at_rest(observation)) is not None:
                 self.skipped.append((observation.index, passed_over))
             if not (tool.closed or observation.events):
@@ -132,29 +110,29 @@ class Estimator:
         if self._grip.begins(tool):
             self._release()
             self._grip.closing = tool
-        model, began = self._begun, time.perf_counter()
+        sheet, began = self._begun, time.perf_counter()
         track = self._see(observation)
         seen = time.perf_counter()
         if not track.visible.any():
             self.skipped.append((observation.index, "no particle was seen"))
             return None
         hold, before = self._grasp(track, tool)
-        frame = fuse(track, hold, tool, before, grip_sd=self.config.grip_sd, field=model.field)
+        frame = fuse(track, hold, tool, before, grip_sd=self.config.grip_sd, field=sheet.field)
         self._slip, self._seen_precision = hold.slip(track, tool), track.precision[track.visible].mean(axis=0)
-        model.state, update = model.filter.update(model.state, frame.evidence, jnp.asarray(frame.start))
+        sheet.state, update = sheet.filter.update(sheet.state, frame.evidence, jnp.asarray(frame.start))
         if not update.explains_the_frame:
             raise PerceptionError(
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
             )
-        self._grip.hold, model.x = hold, np.asarray(update.x)
+        self._grip.hold, sheet.x = hold, np.asarray(update.x)
         if self.config.refinement == "frames":
-            model.state = model.filter.resample(model.state)
-        summary = model.state.summary
+            sheet.state = sheet.filter.resample(sheet.state)
+        summary = sheet.state.summary
         b = np.asarray(summary.b)
         return Estimate(
             index=observation.index,
             time=observation.time,
-            positions=model.x,
+            positions=sheet.x,
             observed=track.positions,
             mean=b,
             sd=np.asarray(summary.sd),
@@ -162,7 +140,7 @@ class Estimator:
             held=hold.held,
             entropy=float(summary.entropy),
             nis=float(update.nis),
-            boundary_energy=0.5 * float(np.mean(b * np.sum((model.x - self.sheet.rest) ** 2, axis=1))),
+            boundary_energy=0.5 * float(np.mean(b * np.sum((sheet.x - self.sheet.rest) ** 2, axis=1))),
             update_s=time.perf_counter() - seen,
             perception_s=seen - began,
             converged=update.reason is not Convergence.SEARCH_CUT_OFF,
@@ -175,11 +153,11 @@ class Estimator:
             PerceptionError: no frame has shown the sheet.
             MeshError: the sheet at rest is folded, or not one sheet.
         """
-        if self._model is None:
+        if self._sheet is None:
             if not self._perception.ready:
                 raise PerceptionError("no frame has shown the sheet yet; wait for one before planning a grasp.")
             with jax.enable_x64(True), one_thread():
-                self._model = self._build()
+                self._sheet = TrackedSheet.build(self._perception.sheet(), self.declaration, self.config)
         return self.sheet
 
     def release(self) -> None:
@@ -226,13 +204,13 @@ class Estimator:
         Raises:
             ValueError: asked before the first frame with closed jaws.
         """
-        model = self._begun
+        sheet = self._begun
         return summaries.detection(
-            model.state.summary,
+            sheet.state.summary,
             self.declaration,
             self.config,
-            noise=model.filter.noise(model.state),
-            refined=Convergence(int(model.state.release_convergence)),
+            noise=sheet.filter.noise(sheet.state),
+            refined=Convergence(int(sheet.state.release_convergence)),
         )
 
     @property
@@ -243,7 +221,7 @@ class Estimator:
     @property
     def changes(self) -> list[Change]:
         """Cuts and sutures so far as the belief took them; of the filter 'implicit' alone."""
-        return [] if self._model is None else list(self._model.state.changes)
+        return [] if self._sheet is None else list(self._sheet.state.changes)
 
     def change_log_bayes_factor(self, change: Change) -> float | None:
         """Return the log Bayes factor of 'the change worked' against 'nothing changed' [nat].
@@ -253,10 +231,10 @@ class Estimator:
         Raises:
             ValueError: asked before `begin`, or of another filter than 'implicit'.
         """
-        model = self._begun
-        filter = model.filter.by_forces("can tell whether a cut or suture worked")
+        sheet = self._begun
+        filter = sheet.filter.by_forces("can infer whether a cut or suture worked")
         with jax.enable_x64(True), one_thread():
-            return filter.log_bayes_factor(model.state, change)
+            return filter.log_bayes_factor(sheet.state, change)
 
     @property
     def balance(self) -> ForceBalance:
@@ -265,9 +243,9 @@ class Estimator:
         Raises:
             ValueError: asked before `begin`, or of another filter than 'implicit'.
         """
-        model = self._begun
+        sheet = self._begun
         with jax.enable_x64(True):
-            return model.filter.by_forces("predicts pulls").balance(model.state)
+            return sheet.filter.by_forces("predicts pulls").balance(sheet.state)
 
     @property
     def attachment_belief(self) -> AttachmentBelief:
@@ -301,13 +279,13 @@ class Estimator:
     @property
     def positions(self) -> Float[np.ndarray, "n 3"]:
         """Positions of the particles [m]: as estimated while the jaws hold some, else as last seen, or at rest."""
-        model = self._begun
+        sheet = self._begun
         if self._grip.hold is not None:
-            return model.x
+            return sheet.x
         if self._open_frame is not None:
             with jax.enable_x64(True), one_thread():
-                model.resting, self._open_frame = self._positions_with_open_jaws(self._open_frame), None
-        return model.resting
+                sheet.open_x, self._open_frame = self._positions_with_open_jaws(self._open_frame), None
+        return sheet.open_x
 
     @property
     def rest_time(self) -> int:
@@ -339,26 +317,10 @@ class Estimator:
         return self._begun.field.widened(held)
 
     @property
-    def _begun(self) -> _Model:
-        if self._model is None:
+    def _begun(self) -> TrackedSheet:
+        if self._sheet is None:
             raise ValueError("the sheet is not known before the first frame with closed jaws; call update first.")
-        return self._model
-
-    def _build(self) -> _Model:
-        """Build the model once the rest shape is known."""
-        sheet = self._perception.sheet()
-        mesh, plane = SheetMesh(sheet.rest, sheet.faces), SheetPlane.through(sheet.rest)
-        check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
-        filter = build_filter(mesh, self.declaration, self.config)
-        state = filter.init(jax.random.key(self.config.seed))
-        return _Model(
-            filter=filter,
-            field=MeshField(plane.flatten(mesh.rest), mesh.faces),
-            prior_entropy=float(state.summary.entropy),
-            state=state,
-            x=mesh.rest,
-            resting=mesh.rest,
-        )
+        return self._sheet
 
     def _change(self, event: Cut | Suture, index: int) -> None:
         """Take a cut or suture into the belief, before the observation that it was seen with."""
@@ -367,15 +329,15 @@ class Estimator:
             self.skipped.append((index, f"the {type(event).__name__.lower()} is beside the sheet, and was left out"))
             return
         self._release()
-        model = self._begun
-        model.state = model.filter.change(model.state, event, region=region, index=index)
+        sheet = self._begun
+        sheet.state = sheet.filter.change(sheet.state, event, region=region, index=index)
 
     def _release(self, *, at_the_end: bool = False) -> None:
-        if (model := self._model) is None:
+        if (sheet := self._sheet) is None:
             return
         thorough = at_the_end or self.config.refinement == "grasps"
         with jax.enable_x64(True), one_thread():
-            self._take(*model.filter.release(model.state, thorough=thorough))
+            self._take(*sheet.filter.release(sheet.state, thorough=thorough))
 
     def _take(self, state: FilterState, summary: PosteriorSummary | None) -> None:
         """Take the state after a refinement, and refuse a posterior that is not finite."""
@@ -393,11 +355,11 @@ class Estimator:
 
     def _prediction(self, tool: ToolState) -> Believed:
         """Return the state before a frame, b, and the moved grip, for a cloud without identities."""
-        model = self._begun
-        hold, before = self._grasp(Track.of_nothing(len(model.x)), tool)
+        sheet = self._begun
+        hold, before = self._grasp(Track.of_nothing(len(sheet.x)), tool)
         stiffness = jnp.where(hold.held, self.config.grip_stiffness * self.declaration.membrane_stiffness, 0.0)
         moved = pull(before, tool, hold)
-        return before, np.asarray(model.state.summary.b), Grip.of(moved.tip, moved.length, stiffness)
+        return before, np.asarray(sheet.state.summary.b), Grip.of(moved.tip, moved.length, stiffness)
 
     def _grasp(self, track: Track, tool: ToolState) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
         """Return the grasp of a frame, and the state to start from; see `GripTracker.grasp`."""

@@ -1,4 +1,4 @@
-"""One frame's evidence: what was seen of the particles, and what the tool says of those that it holds."""
+"""One frame's evidence: positions by perception, and by the tool for the particles that it holds."""
 
 from dataclasses import dataclass
 

@@ -6,8 +6,8 @@ answer. With r = (1 - s) f + s b_ref d as in `force_balance`, D = dr/ds, G = dr/
 
     e + D ds + G dlog(factor) ~ N(0, N).
 
-Frames add up. ds is marginalised with what the belief says of s besides the frames (its sites), and the remainder is a
-Gauss-Newton step of the log factors. Then the attachments are found again with the changed sheet, until no factor
+Frames add up. ds is marginalised with the belief's sites, which stand for the prior of s, and the remainder is a
+Gauss-Newton step of the log factors. Then the attachments are estimated again with the changed sheet, until no factor
 moves.
 """
 
@@ -31,9 +31,9 @@ from .physics.ratios import ratios, scaled
 MAX_PASSES = 12
 """Most Gauss-Newton steps, each with a refinement of the attachments."""
 PRIOR_SD = 2.0
-"""Prior standard deviation of a log factor [nat]: where the frames say nothing, a parameter stays as declared."""
+"""Prior standard deviation of a log factor [nat]: without evidence a parameter stays as declared."""
 MIN_FACTOR_PRECISION = 1e-9
-"""Precision that keeps the covariance finite where the frames say nothing [1/nat^2]: a standard deviation of 3e4."""
+"""Precision that keeps the covariance finite where the frames hold no evidence [1/nat^2]."""
 MAX_LOG_STEP = 1.0
 """Longest step of a log factor [nat]."""
 LAST_STEP = 0.1

@@ -9,7 +9,7 @@ class FilterConfig:
 
     force_sd_floor: float = 0.25
     """Standard deviation of the force error where no forces meet [EstimatorConfig.force_sd]. Without a floor a sheet
-    that hardly moves would seem to say much. With 1, attachments of 0.003 k are lost in the noise."""
+    that hardly moves would seem to hold much evidence. With 1, attachments of 0.003 k are lost in the noise."""
     smooth_force: float = 3.0
     """Residual force at which a state is smooth enough to be linearised at [smallest standard deviation of the force
     error]. The balance of forces is linear only near a smooth state; observed positions are crumpled by noise."""

@@ -8,7 +8,7 @@ for k samples m, the latest and others since the last cut or suture, with J = df
 
 It is computed in information form, which is equivalent.
 
-Differences from the paper, and choices where it says nothing:
+Differences from the paper, and choices where it gives nothing:
 
 - The paper's stacked samples share one common noise (R = [I ... I]), which no sensor has. Here V is block-diagonal.
 - As in the paper, an old sample that is drawn again counts again.

@@ -69,7 +69,7 @@ class Filter(eqx.Module, Generic[State]):
 
         Returns:
             The state and the outcome. If no finite positions and stiffnesses explain the frame, the state is as if the
-            frame had not been there, and the outcome says so (`Update.explains_the_frame`).
+            frame had not been there, and `Update.explains_the_frame` is False.
         """
 
     @abstractmethod

@@ -172,7 +172,7 @@ class ForceBalance(eqx.Module):
         """Return the frame linearised at the state that Gauss-Newton steps from x, at fixed s, lead to.
 
         The search ends where a step lowers the cost by less than `FilterConfig.min_cost_decrease` of it, and is cut off
-        after `FilterConfig.max_state_steps`; `Frame.converged` tells which.
+        after `FilterConfig.max_state_steps`: then `Frame.converged` is False.
         """
         config = self.config
 

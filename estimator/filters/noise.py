@@ -9,7 +9,7 @@ over m particles. Independent frames add up: E |sum_t z_t|^2 = sum_t gamma_t ove
 stays the same from frame to frame, as most of what a model lacks does, adds up faster, and counts by its sum [MacKay
 1992, doi:10.1162/neco.1992.4.3.415, for the degrees of freedom]. A ratio of the two above 1 is the factor by which the
 variance was too small. A variance is only ever inflated above the assumed one, never reduced: the fit of s absorbs part
-of both noises, and data say little of a noise that is smaller than the other.
+of both noises, and data hold little evidence about a noise that is smaller than the other.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a filter says after a frame or a grasp, with the reason where its search or its samples did not converge."""
+"""The posterior after a frame or a grasp, with the reason where a search or samples did not converge."""
 
 from enum import IntEnum
 from typing import Any

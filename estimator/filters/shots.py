@@ -70,7 +70,7 @@ class ShotHistory(eqx.Module):
             grip_stiffness: of the springs to the tip [N/m].
 
         Raises:
-            ValueError: the evidence does not say which step led to the frame.
+            ValueError: the evidence lacks the step that led to the frame.
         """
         pull = evidence.pull
         if pull is None:

@@ -1,4 +1,4 @@
-"""Weight and bending relative to the membrane, found with the attachments unknown; and refused where nothing tells."""
+"""Weight and bending relative to the membrane are identified with unknown attachments, and refused without evidence."""
 
 from dataclasses import replace
 
@@ -14,17 +14,17 @@ from jiggle_mj.material import DOUBTFUL, material
 from tests.support.small_sheet import DECLARATION, attached, follow, lifts, observed, sheet, sheet_energy, sheet_filter
 
 WEIGHT, BENDING = 0.6, 1.7
-"""What is declared, times the truth."""
+"""Declared weight and bending, as factors on the truth [1]."""
 SEEDS = range(2)
 
 
 def declared() -> np.ndarray:
-    """Log factors of the truth on what is declared."""
+    """Return the log factors of the truth on the declaration [nat]."""
     return -np.log([WEIGHT, BENDING])
 
 
 def test_scaling_is_building_from_another_declaration():
-    """Forces of both, at a state with every term at work."""
+    """The forces of both agree, at a state in which every term acts."""
     other = replace(DECLARATION, areal_density=WEIGHT, thickness=DECLARATION.thickness * BENDING**0.5)
     x = jnp.asarray(lifts()[2].x)
     found = scaled(sheet_energy(), jnp.log(jnp.array([WEIGHT, BENDING]))).internal_gradient(x)
@@ -39,7 +39,7 @@ def test_a_sheet_without_gravity_has_no_weight():
 
 @pytest.fixture(scope="module")
 def runs() -> list[Identification]:
-    """Four lifts of a sheet that is declared too light and too stiff to bend."""
+    """Identify a sheet that is declared too light and too stiff to bend, from four lifts."""
     wrong = scaled(sheet_energy(), jnp.log(jnp.array([WEIGHT, BENDING])))
     found = []
     for seed in SEEDS:
@@ -53,7 +53,7 @@ def runs() -> list[Identification]:
 
 @pytest.mark.slow
 def test_the_truth_is_found_within_its_standard_errors(runs):
-    """Also in the mean over the seeds, where a bias would show."""
+    """Also in the mean over the seeds, where a bias would show: 3.5 and 3 standard errors are the bars."""
     scores = np.array(
         [
             [
@@ -70,7 +70,7 @@ def test_the_truth_is_found_within_its_standard_errors(runs):
 
 
 @pytest.mark.slow
-def test_standard_errors_say_something(runs):
+def test_standard_errors_are_small(runs):
     assert all(run.log_sd["weight"] < 0.1 and run.log_sd["bending"] < DOUBTFUL for run in runs)
 
 
@@ -82,8 +82,8 @@ def test_the_attachments_are_found_with_the_right_sheet(runs):
 
 
 @pytest.mark.slow
-def test_frames_at_rest_say_nothing():
-    """The first of each lift, where nothing has moved yet."""
+def test_frames_at_rest_hold_no_evidence():
+    """Nothing has moved yet in the first frame of each lift."""
     filter, frames = sheet_filter(1e-4), lifts()[::4]
     state, *_ = follow(filter, frames, [observed(frame, i) for i, frame in enumerate(frames)])
     run = identify(filter, state, on_pass=lambda _: None)
@@ -92,7 +92,7 @@ def test_frames_at_rest_say_nothing():
     assert found.declaration == DECLARATION
 
 
-def test_what_is_found_becomes_a_declaration():
+def test_the_identified_sheet_becomes_a_declaration():
     found = material(DECLARATION, {"weight": 0.5, "bending": 4.0}, {"weight": 0.02, "bending": 0.1}, converged=True)
     assert set(found.refused) == {"membrane stiffness"}
     assert found.declaration.membrane_stiffness == pytest.approx(2 * DECLARATION.membrane_stiffness)

@@ -1,5 +1,5 @@
-"""What every filter keeps: it sharpens if it states an uncertainty, repeats itself to the byte, takes no notice of what
-was not seen, and forgets a frame that no state explains."""
+"""What holds for every filter: updates sharpen the belief, repeat to the byte, ignore what was not seen, and leave out
+a frame that no state explains."""
 
 import copy
 from functools import cache
@@ -65,7 +65,7 @@ MOSTLY_QUICK = (implicit, explicit, nnls, *(pytest.param(one, marks=pytest.mark.
 
 
 def frame(number: int, hidden: np.ndarray | None = None, lie: float = 0.0) -> Evidence:
-    """Frame `number` of the first lift; what is hidden has no precision, and `lie` [m] is added to it."""
+    """Return frame `number` of the first lift; hidden particles have no precision, and `lie` [m] is added to them."""
     now, before = lifts()[number], lifts()[number - 1]
     y = now.x + NOISE * np.random.default_rng(number).normal(size=now.x.shape)
     precision = np.broadcast_to(np.eye(3) / NOISE**2, (N, 3, 3)).copy()
@@ -90,6 +90,7 @@ def run(filter: Filter, frames: list[Evidence]) -> tuple[FilterState, list[Updat
 
 @pytest.mark.parametrize("make", MOSTLY_QUICK)
 def test_every_filter_sharpens_stays_non_negative_and_repeats_itself(make):
+    """Adam gives no uncertainty; the others lower the entropy with every frame."""
     frames = [frame(number) for number in (1, 2, 3)]
     first, second = run(make(), frames)[1], run(make(), frames)[1]
     entropies = [float(make().init(KEY).summary.entropy), *(float(out.entropy) for out in first)]
@@ -119,8 +120,8 @@ def test_what_was_not_seen_does_not_matter(make):
 
 
 @pytest.mark.parametrize("make", FILTERS)
-def test_a_frame_without_a_state_is_said_to_be_so_and_forgotten(make):
-    """The caller refuses it; later frames, and the opening of the jaws, go on as if it had not been."""
+def test_a_frame_without_a_state_is_refused_and_left_out(make):
+    """Later frames, and the opening of the jaws, go on as if it had not been there."""
     filter, good, bad = make(), [frame(1), frame(2)], frame(3)
     bad = eqx.tree_at(lambda one: one.y, bad, bad.y * jnp.nan)
     first, _ = run(filter, good[:1])

@@ -1,4 +1,4 @@
-"""What a frame says of the attachments: the dense formula, from free to welded, and particles that were not seen."""
+"""A frame's evidence about the attachments agrees with the dense formula, from free to welded."""
 
 from dataclasses import replace
 
@@ -31,10 +31,10 @@ def balance() -> ForceBalance:
 
 
 def test_information_equals_the_dense_formula(balance):
-    """D^T N^-1 D, -D^T N^-1 e and e^T N^-1 e over particles that are not held, with N = V + H R H^T written out.
+    """Precision, score and chi2 are D^T N^-1 D, -D^T N^-1 e and e^T N^-1 e over free particles, with N = V + H R H^T.
 
-    tau grows, from FORCE_SD, with the sum of what the elements around a particle pull at it. D is shrunk by a multiple
-    of the share that the covariance of x given all that was seen makes up.
+    tau grows, from FORCE_SD, with the sum of the forces of the elements around a particle. D is shrunk by a multiple of
+    the share that its error makes up, by the covariance of x given all that was seen.
     """
     frame = lifts()[3]
     seen, x = evidence(frame, 1), frame.x
@@ -63,8 +63,8 @@ def test_information_equals_the_dense_formula(balance):
     V = np.diag(((1 - each) * np.repeat(tau, 3)) ** 2 + (each * K * ANCHOR_SD) ** 2)
     W = np.where(free, 1 / np.diagonal(V), 0)
     covariance = np.linalg.inv(np.linalg.inv(R) + H.T @ (W[:, None] * H))
-    turn = K * np.eye(3 * N) - stiff
-    error = np.diagonal(turn @ covariance @ turn.T).reshape(N, 3).sum(axis=1)
+    dD_dx = K * np.eye(3 * N) - stiff
+    error = np.diagonal(dD_dx @ covariance @ dD_dx.T).reshape(N, 3).sum(axis=1)
     D *= np.maximum(1 - CONFIG.error_weight * error / np.sum(D**2, axis=0), 0)
     e = ((1 - each) * internal.ravel() + each * K * d.ravel() + H @ (np.asarray(seen.y) - x).ravel())[free]
     D, N_inverse = D[free], np.linalg.inv((V + H @ R @ H.T)[np.ix_(free, free)])
@@ -76,7 +76,7 @@ def test_information_equals_the_dense_formula(balance):
     np.testing.assert_allclose(found.shift, score + expected @ s, atol=1e-6 * np.abs(expected @ s).max())
 
 
-def test_the_slope_is_the_derivative_of_the_balance(balance):
+def test_dr_ds_is_the_derivative_of_the_residual_force(balance):
     frame = lifts()[3]
     seen, x = evidence(frame, 1), jnp.asarray(frame.x)
     s, step = jnp.asarray(np.random.default_rng(1).uniform(0, 1, N)), 1e-6
@@ -96,7 +96,7 @@ def test_at_a_weld_the_reaction_force_shows(balance):
 
 
 def test_twenty_frames_in_which_nothing_moved_leave_s_unknown(balance):
-    """All slopes are then error, and what chance leaves of them must not add up: an s in [0, 1] has 0.29 by itself."""
+    """Every D is then error, which must not add up over frames: 0.29 is the standard deviation of any s in [0, 1]."""
     frame = lifts()[0]
     np.testing.assert_array_equal(frame.x, sheet().rest)
     search = eqx.filter_jit(lambda seen: balance.approach(seen.y, jnp.zeros(N), seen).x)

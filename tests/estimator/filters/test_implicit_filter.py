@@ -1,4 +1,4 @@
-"""The implicit filter on its own engine: attachments from soft to welded, honest uncertainty, missing particles."""
+"""The implicit filter finds attachments from soft to welded on its own engine, with uncertainties that hold."""
 
 import copy
 from dataclasses import replace
@@ -28,7 +28,7 @@ from tests.support.small_sheet import (
 )
 
 FORCE_SD = 1e-4
-"""[N]; small, as the data come from the filter's own model."""
+"""Standard deviation of the force error [N]; small, as the data come from the filter's own model."""
 SOFT_TO_RIGID = (STIFFNESS, pytest.param(10 * STIFFNESS, marks=pytest.mark.slow), np.inf)
 """0.1 and 1 times the membrane stiffness, and a weld [N/m]."""
 SEEDS = range(3)
@@ -52,17 +52,18 @@ def run(frames: tuple[Lift, ...], seed: int):
 
 @cache
 def runs(stiffness: float) -> list[Any]:
-    """Several seeds: what is held rigidly shows itself in some more than in others."""
+    """Return the runs of several seeds: rigid attachments show in some more than in others."""
     return [run(lifts(stiffness), seed) for seed in SEEDS]
 
 
 @pytest.mark.parametrize("stiffness", SOFT_TO_RIGID)
 def test_the_attached_particles_are_found_and_no_others(stiffness):
-    """Four corner lifts with 0.1 mm of noise. Particles inside a stiff patch bear no load: nothing can show them.
+    """Four corner lifts with 0.1 mm of noise show the rim; particles inside a stiff patch have no load and cannot show.
 
-    Beside a weld hardly anything moves, so that single neighbours may pass for held, and some of its rim may not.
+    Beside a weld hardly anything moves: single neighbours may seem attached, and some of its rim may seem free. So the
+    bar is 0.6 of a weld's rim, and 0.9 of a soft one's.
     """
-    probability, around = np.array([said.probability for _, said in runs(stiffness)]), rim()
+    probability, around = np.array([summary.probability for _, summary in runs(stiffness)]), rim()
     found = probability > 0.5
     assert found[:, around].mean() >= (0.9 if stiffness <= STIFFNESS else 0.6)
     assert probability[:, around].mean() > 0.6
@@ -72,7 +73,7 @@ def test_the_attached_particles_are_found_and_no_others(stiffness):
 
 
 def rim() -> np.ndarray:
-    """Attached particles with a free neighbour."""
+    """Return the attached particles with a free neighbour."""
     edges, held = sheet().edges, attached()
     mixed = edges[held[edges].sum(axis=1) == 1]
     return held & np.isin(np.arange(sheet().n), mixed)
@@ -80,8 +81,8 @@ def rim() -> np.ndarray:
 
 @pytest.mark.parametrize("stiffness", SOFT_TO_RIGID)
 def test_intervals_hold_the_truth(stiffness):
-    """Nine tenths are stated, over all particles; most of those of a weld are open-ended."""
-    lower, upper = np.moveaxis([said.belief.interval() for _, said in runs(stiffness)], 1, 0)
+    """The intervals hold 90 % over all particles; most of those of a weld are open-ended."""
+    lower, upper = np.moveaxis([summary.belief.interval() for _, summary in runs(stiffness)], 1, 0)
     truth = np.where(attached(), stiffness, 0.0)
     holds = (lower <= truth) & (truth <= upper)
     assert holds.mean() >= 0.9
@@ -90,17 +91,17 @@ def test_intervals_hold_the_truth(stiffness):
 
 def test_a_free_sheet_has_no_attachment():
     for seed in range(2):
-        _, said = run(lifts(0.0), seed)
-        assert not (np.asarray(said.probability) > 0.5).any()
+        _, summary = run(lifts(0.0), seed)
+        assert not (np.asarray(summary.probability) > 0.5).any()
 
 
-def test_errors_are_as_large_as_stated():
+def test_errors_are_as_large_as_their_covariance_claims():
     """NEES per degree of freedom of s where the truth is no bound of it."""
-    assert 0.3 < np.mean([nees(said.belief) for _, said in runs(STIFFNESS)]) < 2
+    assert 0.3 < np.mean([nees(summary.belief) for _, summary in runs(STIFFNESS)]) < 2
 
 
 @pytest.mark.parametrize("stiffness", SOFT_TO_RIGID)
-def test_innovations_are_as_large_as_stated(stiffness):
+def test_innovations_are_as_large_as_expected(stiffness):
     assert all(0.5 < float(out.nis) < 1.5 for out, _ in runs(stiffness))
 
 

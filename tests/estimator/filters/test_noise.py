@@ -1,4 +1,4 @@
-"""Noise learned from what is left unexplained: kept where it is right, inflated where it is not."""
+"""Noise learned from residuals is kept where it is right, and inflated where it is too small."""
 
 from functools import reduce
 from operator import add
@@ -20,7 +20,7 @@ DRAWS = 60
 
 @pytest.fixture(scope="module")
 def drawn() -> list[ForceResiduals]:
-    """Of frames whose errors are drawn from the model, linear around a lifted state with half of s rigid."""
+    """Return residuals of frames with errors drawn from the model, at a lifted state with s = 0.5 attached."""
     balance, truth = sheet_balance(FORCE_SD), lifts()[3]
     seen, s = observed(truth, 0), jnp.asarray(0.5 * attached())
     frame = eqx.filter_jit(balance.linearise)(jnp.asarray(truth.x), s, seen)
@@ -38,7 +38,7 @@ def drawn() -> list[ForceResiduals]:
 
 
 def test_squares_equal_the_degrees_of_freedom_where_the_noise_is_right(drawn):
-    """Forces and positions apart, over single frames and over sums of them; four standard errors."""
+    """For forces and positions separately, over single frames and over their sum; the bars are four standard errors."""
     for name in ("force", "position"):
         ratio = [float(jnp.sum(getattr(one, name) ** 2) / getattr(one, f"{name}_degrees")) for one in drawn]
         assert np.mean(ratio) == pytest.approx(1, abs=4 * np.std(ratio) / np.sqrt(DRAWS)), name
@@ -49,13 +49,13 @@ def test_squares_equal_the_degrees_of_freedom_where_the_noise_is_right(drawn):
 
 
 def test_an_error_that_persists_counts_by_its_sum(drawn):
-    """Ten frames with one and the same error are worth one of them, not ten."""
+    """Ten frames with the same error count as one of them, not as ten."""
     persistent = reduce(add, [drawn[0]] * 10)
     single = float(jnp.sum(drawn[0].force ** 2) / drawn[0].force_degrees)
     assert Noise().learned([persistent]).force == pytest.approx(10 * single)
 
 
-def test_noise_is_never_narrower_than_typed_and_keeps_still_about_right(drawn):
+def test_noise_is_never_smaller_than_assumed_and_stays_where_it_is_about_right(drawn):
     tenth = 0.1 * drawn[0].force, 0.1 * drawn[0].position
     small = eqx.tree_at(lambda one: (one.force, one.position), drawn[0], tenth)
     assert Noise().learned([small]) == Noise()
@@ -76,7 +76,7 @@ def test_the_filter_finds_how_noisy_positions_are(runs, times):
 
 
 def test_positions_noisier_than_stated_do_not_make_the_filter_report_what_is_not_there(runs):
-    """It misses what it can no longer see; without learning it reports free particles too, and is surer than right."""
+    """It misses what it can no longer see. Without learning it reports free particles too, and is overconfident."""
     _, learned = runs[4]
     _, assumed = run(4, learns_noise=False)
     wrong = [int((found(one) & ~attached()).sum()) for one in (learned, assumed)]
@@ -101,6 +101,6 @@ def found(summary: PosteriorSummary) -> np.ndarray:
 
 
 def surprise(summary: PosteriorSummary) -> float:
-    """Mean negative logarithm of what P(attached) says of the truth [nat]."""
+    """Return the mean negative log probability of the truth by P(attached) [nat]."""
     of_truth = np.where(attached(), summary.probability, 1 - np.asarray(summary.probability))
     return float(-np.mean(np.log(of_truth)))
