@@ -6,7 +6,7 @@ from typing import Literal, get_args
 from jiggle_mj.options import FilterName
 
 from .belief.prior import PriorConfig
-from .filters.config import FilterConfig, SamplerConfig
+from .filters.config import FilterConfig, SamplingConfig
 from .physics.surrogate import Membrane
 
 Refinement = Literal["grasps", "frames", "end"]
@@ -66,7 +66,7 @@ class EstimatorConfig:
     """Mean stiffness above which filters without P(attached) report a particle as attached [k]."""
     linearisation: FilterConfig = field(default_factory=FilterConfig)
     """Numbers of the filter 'implicit'."""
-    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
     """Numbers of samples of the filter 'implicit'."""
     prior: PriorConfig = field(default_factory=PriorConfig)
     """Numbers of the prior of the filter 'implicit'."""

@@ -39,7 +39,7 @@ def build_filter(mesh: SheetMesh, declaration: Declaration, config: EstimatorCon
     if config.filter == "implicit":
         balance = force_balance(mesh, energy, declaration, config)
         prior = prior_belief(mesh, reference=float(balance.reference), config=config.prior)
-        return ImplicitFilter(declared_balance=balance, prior=prior, sampler=config.sampler)
+        return ImplicitFilter(declared_balance=balance, prior=prior, sampling=config.sampling)
     prior_sd, grip_stiffness = config.prior_sd * k, config.grip_stiffness * k
     mean = PRIOR_MEAN if config.filter == "explicit" else 0.0
     prior = BoundaryBelief.prior(mesh.n, mean=mean, sd=prior_sd)

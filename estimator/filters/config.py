@@ -39,7 +39,7 @@ class FilterConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SamplerConfig:
+class SamplingConfig:
     """Numbers of samples; `Sampler.run` explains rounds and doublings."""
 
     burn_in: int = 3
@@ -68,7 +68,7 @@ class SamplerConfig:
         return self.thorough_rounds, self.thorough_doublings
 
 
-def _check_positive(config: FilterConfig | SamplerConfig) -> None:
+def _check_positive(config: FilterConfig | SamplingConfig) -> None:
     for field in fields(config):
         if not (value := getattr(config, field.name)) > 0:
             raise ValueError(f"{type(config).__name__}.{field.name} must be above 0; got {value}.")

@@ -22,7 +22,7 @@ from jiggle_mj.options import FilterName
 from ..belief.attachment_belief import AttachmentBelief
 from ..belief.topology import Change, after
 from ..physics.energy import SheetEnergy
-from .config import FilterConfig, SamplerConfig
+from .config import FilterConfig, SamplingConfig
 from .evidence import Evidence
 from .filter import FilterState, ForceBalanceFilter, Region
 from .force_balance import ForceBalance
@@ -81,7 +81,7 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
     """The balance of forces with the assumed noise and the declared parameters."""
     prior: AttachmentBelief
     """Belief before the first frame."""
-    sampler: SamplerConfig = eqx.field(static=True, default=SamplerConfig())
+    sampling: SamplingConfig = eqx.field(static=True, default=SamplingConfig())
     """Numbers of samples."""
     learns_noise: bool = eqx.field(static=True, default=True)
     """Whether residuals may inflate the assumed noise; False keeps it as it is."""
@@ -129,7 +129,7 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
 
     def resample(self, state: ImplicitState) -> ImplicitState:
         """See `Filter.resample`: few samples find most of what propagation misses within a grasp."""
-        return replace(state, summary=sampled(state.belief, state.key, self.sampler.quick, self.sampler))
+        return replace(state, summary=self._quick(state, state.belief))
 
     def release(self, state: ImplicitState, *, thorough: bool = True) -> tuple[ImplicitState, PosteriorSummary | None]:
         """See `Filter.release`: linearise each grasp again that needs it; the next frame begins another grasp.
@@ -162,9 +162,9 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
 
     def log_bayes_factor(self, state: ImplicitState, change: Change) -> float | None:
         """See `ForceBalanceFilter.log_bayes_factor`."""
-        latest = bool(state.changes) and change.before is state.changes[-1].before
-        kept = next((one for one in state.changes if one.before is change.before), change)
-        evidence = state.evidence if latest else kept.evidence
+        is_latest = bool(state.changes) and change.before is state.changes[-1].before
+        stored = next((stored for stored in state.changes if stored.before is change.before), change)
+        evidence = state.evidence if is_latest else stored.evidence
         return None if evidence is None else change.log_bayes_factor(*evidence)
 
     def noise(self, state: ImplicitState) -> Noise:
@@ -203,7 +203,7 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
             state, summary = self._relinearised(state, summary, config.relinearise_beyond, config.max_passes)
         belief = summary.belief
         assert isinstance(belief, AttachmentBelief)
-        return _with_release(state, sampled(belief, state.key, self.sampler.thorough, self.sampler))
+        return _with_release(state, sampled(belief, state.key, self.sampling.thorough, self.sampling))
 
     def _relinearised(
         self, state: ImplicitState, summary: PosteriorSummary, beyond: float, passes: int
@@ -234,11 +234,11 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
 
     def _quick(self, state: ImplicitState, belief: AttachmentBelief) -> PosteriorSummary:
         """Return the posterior by a few samples."""
-        return sampled(belief, state.key, self.sampler.quick, self.sampler)
+        return sampled(belief, state.key, self.sampling.quick, self.sampling)
 
 
 def sampled(
-    belief: AttachmentBelief, key: PRNGKeyArray, rounds: tuple[int, int], config: SamplerConfig
+    belief: AttachmentBelief, key: PRNGKeyArray, rounds: tuple[int, int], config: SamplingConfig
 ) -> PosteriorSummary:
     """Return the posterior by samples.
 
@@ -254,9 +254,9 @@ def sampled(
         return _sampled(belief, key, *map(jnp.asarray, rounds), burn_in=config.burn_in)
 
 
-def quick_summary(belief: AttachmentBelief, *, seed: int = 0, config: SamplerConfig | None = None) -> PosteriorSummary:
+def quick_summary(belief: AttachmentBelief, *, seed: int = 0, config: SamplingConfig | None = None) -> PosteriorSummary:
     """Return the posterior by a few samples."""
-    config = config or SamplerConfig()
+    config = config or SamplingConfig()
     return sampled(belief, jax.random.key(seed), config.quick, config)
 
 
