@@ -1,13 +1,32 @@
 """The estimator's settings, and the ranges that they may have."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from jiggle_mj.options import FilterName
 
+from .belief.prior import PriorConfig
+from .filters.config import FilterConfig, SamplingConfig
 from .physics.surrogate import Membrane
 
 Refinement = Literal["grasps", "frames", "end"]
+
+POSITIVE = (
+    "spacing",
+    "reference",
+    "prior_sd",
+    "force_sd",
+    "anchor_sd",
+    "grip_sd",
+    "grip_stiffness",
+    "detect_above",
+)
+"""Settings that must be above 0."""
+SHARES = ("reference", "prior_sd", "force_sd", "grip_stiffness", "detect_above")
+"""Settings that are shares of the membrane stiffness."""
+LARGEST_RATIO = 1e7
+"""Largest ratio of such a setting to the membrane stiffness, and of the membrane stiffness to it: what float32 can add
+to it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,33 +34,42 @@ class EstimatorConfig:
     """Settings of the estimator; stiffnesses are shares of the declared membrane stiffness k."""
 
     spacing: float = 4.4e-3
-    """Between the particles of a mesh laid over images [m]."""
+    """Distance between the particles of a mesh laid over images [m]."""
     filter: FilterName = "implicit"
-    """How a frame enters the belief: through the balance of forces, or, as in the paper, through a simulated step; the
-    others are baselines: gradient descent on that step, least squares on the forces, and patches through equilibria."""
+    """How a frame updates the belief: 'implicit' by the balance of forces, 'explicit' by a simulated step, as in the
+    paper. The others are baselines: 'adam' descends the gradient of that step, 'nnls' fits forces by least squares,
+    'unscented' sends patches through equilibria."""
+    seed: int = 0
+    """Seed of all draws of the filter. The same frames and seed give the same estimate to the last bit."""
     samples: int = 1
-    """Frames that each update of the explicit filter or of adam simulates, the latest among them."""
+    """Frames that each update of the filters 'explicit' and 'adam' simulates, the latest among them."""
     membrane: Membrane = "triangles"
     """Law of the sheet's plane where no step is simulated: St Venant-Kirchhoff triangles, or springs along edges."""
     reference: float = 1.0
-    """Attachment stiffness in the middle of the implicit filter's scale from free to rigid [k]."""
+    """Attachment stiffness b_ref of the bounded stiffness s = 1/2, for the filter 'implicit' [k]."""
     prior_sd: float = 1 / 75
     """Standard deviation of each attachment stiffness before anything is seen, for the other filters [k]."""
     force_sd: float = 4.5e-3
-    """Standard deviation of the force that the model gets wrong on a particle [k x spacing]; of the implicit filter,
-    where forces of 0.07 k x spacing meet: it is larger in proportion where more do."""
+    """Standard deviation of the model's force error on a particle [k x spacing]. For the filter 'implicit' it holds
+    where forces of 0.07 k x spacing meet, and grows in proportion to them."""
     anchor_sd: float = 1e-4
-    """How far a welded particle may be from its anchor, for the implicit filter [m]."""
+    """Standard deviation of a welded particle from its anchor, for the filter 'implicit' [m]."""
     grip_sd: float = 1.5e-3
-    """How well held particles follow the tip [m]."""
+    """Standard deviation of held particles from where the tip takes them [m]."""
     grip_stiffness: float = 3.0
-    """Of the springs that carry held particles with the tip while the state is searched [k]."""
+    """Stiffness of the springs that move held particles with the tip while the state is searched [k]."""
     refinement: Refinement = "grasps"
-    """When the implicit filter judges noise and belief thoroughly: 'grasps', whenever the jaws open; 'end', at the end
-    alone; 'frames', for a policy, which waits for the belief: at the end alone, and by a few samples after each frame,
-    which takes a second or two instead of a sweep's milliseconds."""
+    """When the filter 'implicit' learns the noise and refines the belief thoroughly: 'grasps', whenever the jaws open;
+    'end', at the end alone; 'frames', for a policy that waits for the belief: thoroughly at the end alone, and by a few
+    samples after each frame, which takes a second or two instead of a sweep's milliseconds."""
     detect_above: float = 0.011
-    """Filters that state no probability report a particle attached when its mean stiffness exceeds this [k]."""
+    """Mean stiffness above which filters without P(attached) report a particle as attached [k]."""
+    linearisation: FilterConfig = field(default_factory=FilterConfig)
+    """Numbers of the filter 'implicit'."""
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    """Numbers of samples of the filter 'implicit'."""
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    """Numbers of the prior of the filter 'implicit'."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -63,21 +91,7 @@ class EstimatorConfig:
             )
         if not (isinstance(self.samples, int) and self.samples >= 1):
             raise ValueError(f"EstimatorConfig.samples must be an integer of at least 1; got {self.samples}.")
-        if self.membrane not in ("triangles", "edges"):
-            raise ValueError(f"EstimatorConfig.membrane must be 'triangles' or 'edges'; got {self.membrane!r}.")
-
-
-POSITIVE = (
-    "spacing",
-    "reference",
-    "prior_sd",
-    "force_sd",
-    "anchor_sd",
-    "grip_sd",
-    "grip_stiffness",
-    "detect_above",
-)
-"""Settings that must be above 0."""
-
-SHARES, LARGEST_RATIO = ("reference", "prior_sd", "force_sd", "grip_stiffness", "detect_above"), 1e7
-"""Settings that are shares of the membrane stiffness, and how far from it they may be either way."""
+        if not (isinstance(self.seed, int) and self.seed >= 0):
+            raise ValueError(f"EstimatorConfig.seed must be an integer of at least 0; got {self.seed}.")
+        if self.membrane not in get_args(Membrane):
+            raise ValueError(f"EstimatorConfig.membrane must be one of {get_args(Membrane)}; got {self.membrane!r}.")

@@ -1,4 +1,4 @@
-"""One frame's evidence: what was seen of the particles, and what the tool says of those that it holds."""
+"""One frame's evidence: positions by perception, and by the tool for the particles that it holds."""
 
 from dataclasses import dataclass
 
@@ -13,19 +13,21 @@ from .grip import GripHold
 from .perception.mesh_field import MeshField
 from .perception.track import Track
 
+FILL_STIFFNESS = 1.0
+"""Roughness penalty of the fields that fill unseen particles [1]: they move with their surroundings."""
+
 
 @dataclass(frozen=True, kw_only=True)
-class Fused:
-    """One frame."""
+class FusedFrame:
+    """One frame as the filter takes it."""
 
     evidence: Evidence
+    """Positions and their precision by perception and grip together."""
     start: Float[np.ndarray, "n 3"]
-    """For a search of the state, smooth where nothing was seen [m]."""
-    slip: float
-    """How far the held particles are seen from where the tip should have taken them, in the median; 0 unseen [m]."""
+    """Positions from which a search of the state begins, smooth where nothing was seen [m]."""
 
 
-def fused(
+def fuse(
     track: Track,
     hold: GripHold,
     tool: ToolState,
@@ -33,31 +35,30 @@ def fused(
     *,
     grip_sd: float,
     field: MeshField,
-) -> Fused:
-    """Put both together.
+) -> FusedFrame:
+    """Combine perception and grip by their precisions.
 
     Args:
         track: what was seen.
         hold: the grasp.
-        tool: where it is now.
+        tool: the tool in this frame.
         before: the state of the frame before, or at rest where the jaws have just closed [m].
-        grip_sd: how well held particles follow the tip [m].
+        grip_sd: standard deviation of held particles from where the tip takes them [m].
         field: fills what is unknown from its surroundings.
     """
     seen, held, expected = track.visible, hold.held, hold.expected(tool)
-    off = np.linalg.norm((track.positions - expected)[seen & held], axis=1)
-    weighed = np.einsum("nij,nj->ni", track.precision, np.nan_to_num(track.positions))
+    weighted = np.einsum("nij,nj->ni", track.precision, np.nan_to_num(track.positions))
     grip = np.where(held, grip_sd**-2, 0.0)
     precision = track.precision + grip[:, None, None] * np.eye(3)
-    weighed = weighed + grip[:, None] * expected
+    weighted = weighted + grip[:, None] * expected
     known = seen | held
     y = np.where(
         known[:, None],
-        np.linalg.solve(np.where(known[:, None, None], precision, np.eye(3)), weighed[..., None])[..., 0],
+        np.linalg.solve(np.where(known[:, None, None], precision, np.eye(3)), weighted[..., None])[..., 0],
         0,
     )
     motion = np.where(known[:, None], y - before, 0.0)
-    start = before + np.where(held[:, None], motion, field.fill(motion, known, stiffness=1.0))
+    start = before + np.where(held[:, None], motion, field.fill(motion, known, stiffness=FILL_STIFFNESS))
     evidence = Evidence(
         y=jnp.asarray(np.where(known[:, None], y, start)),
         precision=jnp.asarray(precision),
@@ -65,10 +66,21 @@ def fused(
         force_unknown=jnp.asarray(field.widened(held)),
         pull=pull(before, tool, hold),
     )
-    return Fused(evidence=evidence, start=start, slip=float(np.median(off)) if len(off) else 0.0)
+    return FusedFrame(evidence=evidence, start=start)
 
 
 def pull(before: Float[np.ndarray, "n 3"], tool: ToolState, hold: GripHold) -> Pull:
-    """The step of the tool that led to a frame."""
+    """Return the step of the tool that led to a frame, from the state `before` it [m]."""
     length = np.linalg.norm(hold.closed_at - hold.tip, axis=1)
     return Pull(before=jnp.asarray(before), tip=jnp.asarray(tool.position), length=jnp.asarray(length))
+
+
+def fill_unseen(track: Track, rest: Float[np.ndarray, "n 3"], field: MeshField) -> Float[np.ndarray, "n 3"]:
+    """Return where the sheet lies with open jaws [m]; what is not seen moves with its surroundings.
+
+    The rest positions where nothing at all is seen.
+    """
+    if not track.visible.any():
+        return rest
+    motion = np.where(track.visible[:, None], np.nan_to_num(track.positions) - rest, 0.0)
+    return rest + field.fill(motion, track.visible, stiffness=FILL_STIFFNESS)

@@ -1,8 +1,9 @@
 """Which particles the tweezer holds, and where it should have taken them.
 
-Held when the jaws close: the particles the recording names, or those within the radius of the tip. They move and turn
-with the tip, give or take. The force on them is unknown, and so is that on their neighbours, since the true tissue's
-points do not sit where the mesh has its own: the filter gives neither a balance of forces.
+Held are, when the jaws close, the particles that the recording names, or those within the radius of the tip. They move
+and rotate with the tip up to `EstimatorConfig.grip_sd`. The force on them is unknown, and so is that on their
+neighbours, since the true tissue's points do not sit where the mesh has its own. The filter uses neither balance of
+forces.
 """
 
 from dataclasses import dataclass
@@ -14,28 +15,32 @@ from scipy.spatial.transform import Rotation
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.observation import ToolState
 
+from .perception.track import Track
+
 
 @dataclass(frozen=True, kw_only=True)
 class GripHold:
     """One grasp, from closing to opening."""
 
     grasp: int
+    """Number of the grasp in the recording."""
     held: Bool[np.ndarray, " n"]
+    """Which particles are held."""
     closed_at: Float[np.ndarray, "n 3"]
     """Positions of the particles when the jaws closed [m]."""
     tip: Float[np.ndarray, " 3"]
-    """The tip when they closed [m]."""
-    turn: Rotation
-    """The tool's orientation when they closed."""
+    """Position of the tip when the jaws closed [m]."""
+    orientation: Rotation
+    """Orientation of the tool when the jaws closed."""
 
     @classmethod
     def close(
         cls, tool: ToolState, positions: Float[np.ndarray, "n 3"], named: Bool[np.ndarray, " n"] | None
     ) -> "GripHold":
-        """Close the jaws over particles at the given positions; `named` overrules the radius.
+        """Close the jaws over particles at the given positions [m]; `named` particles replace those in the radius.
 
         Raises:
-            PerceptionError: nothing is within reach of the jaws.
+            PerceptionError: no particle is within reach of the jaws.
         """
         distance = np.linalg.norm(positions - tool.position, axis=1)
         held = distance <= tool.radius if named is None else named
@@ -45,15 +50,72 @@ class GripHold:
                 f"{distance.min() * 1e3:.1f} mm from the nearest particle, and the jaws reach "
                 f"{tool.radius * 1e3:.1f} mm (check the tool pose, the camera pose, or the radius)."
             )
-        return cls(grasp=tool.grasp, held=held, closed_at=positions, tip=tool.position, turn=_orientation(tool))
+        return cls(grasp=tool.grasp, held=held, closed_at=positions, tip=tool.position, orientation=_orientation(tool))
 
     def rotated(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
-        """Where the held particles would be if they had only turned with the tool, about the tip, since then [m]."""
-        return self.tip + (_orientation(tool) * self.turn.inv()).apply(self.closed_at - self.tip)
+        """Return where the particles would be had they only rotated with the tool, about the tip, since closing [m]."""
+        return self.tip + (_orientation(tool) * self.orientation.inv()).apply(self.closed_at - self.tip)
 
     def expected(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
-        """Where the held particles are if they went with the tool [m]; meaningless for the others."""
+        """Return where the held particles are if they move and rotate with the tool [m]; meaningless for others."""
         return self.rotated(tool) + (tool.position - self.tip)
+
+    def slip(self, track: Track, tool: ToolState) -> float:
+        """Return the median distance of the held particles from where the tool should have taken them [m]; 0 unseen."""
+        distance = np.linalg.norm((track.positions - self.expected(tool))[track.visible & self.held], axis=1)
+        return float(np.median(distance)) if len(distance) else 0.0
+
+
+@dataclass(kw_only=True)
+class GripTracker:
+    """The grasp at hand, over the frames of a recording."""
+
+    hold: GripHold | None = None
+    """What the jaws hold, once a frame of the grasp was used; None while they are open."""
+    closing: ToolState | None = None
+    """The tool when the jaws closed; None while they are open, or where that is not known."""
+
+    def open(self) -> None:
+        """Let go."""
+        self.hold = self.closing = None
+
+    def begins(self, tool: ToolState) -> bool:
+        """Whether closed jaws are those of another grasp than the one at hand."""
+        return self.closing is None or self.closing.grasp != tool.grasp
+
+    def grasp(
+        self,
+        tool: ToolState,
+        *,
+        state: Float[np.ndarray, "n 3"],
+        rest: Float[np.ndarray, "n 3"],
+        track: Track,
+        named: Bool[np.ndarray, " n"] | None,
+    ) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
+        """Return the grasp of a frame, and the state to start from: the last, or rest where the jaws have just closed.
+
+        If the frame in which they closed could not be used, the sheet is taken to have been at rest in it.
+
+        Args:
+            tool: in this frame.
+            state: of the frame before [m].
+            rest: the sheet at rest [m].
+            track: what is seen of the particles in this frame.
+            named: particles that the recording names as held; None where it names none.
+
+        Raises:
+            PerceptionError: no particle is within reach of the jaws.
+        """
+        if self.hold is not None and self.hold.grasp == tool.grasp:
+            return self.hold, state
+        assert self.closing is not None
+        seen = track.visible & (tool is self.closing)
+        at_closing = np.where(seen[:, None], np.nan_to_num(track.positions), rest)
+        try:
+            return GripHold.close(self.closing, at_closing, named), rest
+        except PerceptionError:
+            self.closing = None  # a later frame of this grasp may know better
+            raise
 
 
 def _orientation(tool: ToolState) -> Rotation:

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..belief.attachment_belief import AttachmentBelief
-from ..filters.evidence import PosteriorSummary
-from ..filters.implicit import likeliest, reconsidered
+from ..filters.implicit import likeliest, quick_summary
+from ..filters.posterior_summary import PosteriorSummary
 from .every_frame import cost_under, directions, linearised, weighed
 from .linear import Metric, NormalEquations
 from .normal_equations import reduced
@@ -287,7 +287,7 @@ def _summary(problem: Problem, square: np.ndarray, point: Point, free: np.ndarra
     A, C, gt = _of_parameters(square, point, free, sd)
     L = square[:n, :n] - C @ np.linalg.solve(A, C.T)
     shift = L @ point.s - square[:n, -1] + C @ np.linalg.solve(A, gt)
-    return reconsidered(problem.prior.add(jnp.asarray(L), jnp.asarray(shift)))
+    return quick_summary(problem.prior.add(jnp.asarray(L), jnp.asarray(shift)))
 
 
 def _of_parameters(

@@ -126,14 +126,14 @@ def _sd(
     n, frame, held = len(x), metric.frame, np.asarray(seen.held)
     rows = np.zeros((n + 1, 3, n + 1, 3))
     neighbours = np.asarray(metric.balance.neighbours)
-    rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(np.asarray(frame.rows), 2, 3).swapaxes(2, 3)
+    rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(np.asarray(frame.dr_dx), 2, 3).swapaxes(2, 3)
     H = rows[:n, :, :n].reshape(3 * n, 3 * n)
     H[np.repeat(held, 3)] = 0.0
     H[np.repeat(held, 3), np.repeat(held, 3)] = PINNED
     inverse = np.linalg.inv(H)
     force = np.where(held, 0.0, np.asarray(problem.sheet.balance.error(x)))
     wrong = np.sum((inverse.reshape(3 * n, n, 3) * force[None, :, None]) ** 2, axis=(1, 2))
-    slope = np.where(held[:, None], 0.0, np.asarray(frame.slope))
+    slope = np.where(held[:, None], 0.0, np.asarray(frame.dr_ds))
     response = np.einsum("ani,ni->an", inverse.reshape(3 * n, n, 3), slope)
     unsure = np.sum((response @ known) * response, axis=1)
     white = 1 / np.maximum(np.asarray(seen.precision)[:, 0, 0], 1.0)

@@ -21,7 +21,8 @@ from jaxtyping import Array, Float
 from ..effects.mechanical import cosines, flat
 from ..effects.sheet_model import FrameContext
 from ..filters.evidence import Evidence
-from ..filters.force_balance import ForceBalance, Frame
+from ..filters.force_balance import ForceBalance
+from ..filters.frame import Frame
 from ..physics.membrane import TriangleMembrane
 from .closed_frames import ClosedFrame
 from .sheet import PredictedSheet, beyond_tool, look, mean_of_held
@@ -70,7 +71,7 @@ class Metric(eqx.Module):
 
     def forces(self, off: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """H (y - h(x)) for what is seen off the prediction."""
-        return self.balance.apply(self.frame.rows, self.seen[:, None] * off)
+        return self.balance.apply(self.frame.dr_dx, self.seen[:, None] * off)
 
     def log_determinant(self) -> Float[Array, ""]:
         """Ln |N + H F F^T H^T| for a given H and precision of what is seen, up to a constant."""
@@ -184,7 +185,7 @@ def _metric(
     noise: Float[Array, "n modes"],
 ) -> Metric:
     smooth = noise[:, None, :, None] * jnp.eye(3)[None, :, None, :]
-    smooth = _each(partial(balance.apply, linear.rows), _as_seen(frame, smooth.reshape(len(noise), 3, -1)))
+    smooth = _each(partial(balance.apply, linear.dr_dx), _as_seen(frame, smooth.reshape(len(noise), 3, -1)))
     white = _each(partial(balance.whitened, linear), smooth)
     metric = Metric(
         balance=balance,
@@ -221,7 +222,7 @@ def _columns(
     push, shown, taken = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
     model = sheet.model(theta, moment, frame.way)
     e = metric.forces(frame.y - look(model, x)) + linear.unbalanced
-    seen = _each(partial(balance.apply, linear.rows), _as_seen(frame, shown))
+    seen = _each(partial(balance.apply, linear.dr_dx), _as_seen(frame, shown))
     tool = jnp.concatenate(
         [taken, jnp.zeros((3, N_FIELDS)), beyond_tool(sheet, model, theta, frame, moment, x)[:, None]], axis=1
     )
@@ -244,7 +245,7 @@ def _as_seen(frame: ClosedFrame, off: Float[Array, "n 3 k"]) -> Float[Array, "n 
 def _whole(metric: Metric, beyond: Float[Array, "n 3 j"]) -> Float[Array, "_k _k"]:
     """Inner products of D's columns, one a particle, of G's, Q's and e, G and e given."""
     balance, frame = metric.balance, metric.frame
-    slope, n = frame.slope, len(frame.s)
+    slope, n = frame.dr_ds, len(frame.s)
     own = balance.precision_along(frame, slope)
     shared = jnp.einsum("ni,nic->cn", slope, metric.noise)
     own = own - shared.T @ jax.scipy.linalg.cho_solve((metric.spread, True), shared)

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..belief.attachment_belief import AttachmentBelief
+from ..belief.prior import prior_belief
 from ..effects.effect import Effect
 from ..effects.sheet_model import centred, nominal_energy
 from ..filters.build import force_balance
-from ..filters.implicit import prior_belief
 from ..physics.mesh import SheetMesh
 from .closed_frames import FrameHistory
 from .dataset import Dataset
@@ -55,7 +55,7 @@ class Problem:
         estimator = dataset.estimator
         mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
         energy = nominal_energy(mesh, estimator.declaration)
-        balance = force_balance(mesh, energy, estimator.declaration, estimator.config).widened(FORCE_VARIANCE)
+        balance = force_balance(mesh, energy, estimator.declaration, estimator.config).inflated(FORCE_VARIANCE)
         library = tuple(effect for effect in library if estimator.declaration.hangs or not effect.hanging)
         sheet = PredictedSheet(balance=balance, view=centred(mesh), library=library)
         own = {name: sd for name, sd in NUISANCE.items() if any(effect.name == name for effect in library)}
@@ -71,7 +71,7 @@ class Problem:
 
     def widened(self, variance: float, amplitude: float) -> "Problem":
         """With that many times the variance of the forces, and smooth fields of another amplitude."""
-        sheet = eqx.tree_at(lambda one: one.balance, self.sheet, self.sheet.balance.widened(variance))
+        sheet = eqx.tree_at(lambda one: one.balance, self.sheet, self.sheet.balance.inflated(variance))
         return replace(self, sheet=sheet, amplitude=amplitude)
 
     def frames(self, parts: Iterable[int]) -> list[int]:

@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float
 from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.regions import distance_to_path
 
-from ..filters.implicit import SPIKE, SPREAD
 from .attachment_belief import AttachmentBelief
+from .prior import PriorConfig
 
 FAILS = 0.1
 """Chance that a cut or suture has not worked, before anything is seen of it."""
@@ -89,7 +89,8 @@ def _log_bayes_factor(
     shift: Float[Array, " n"],
 ) -> Float[Array, ""]:
     meant = before.bounded(jnp.full(len(region), stiffness))
-    worked = before.fixed(region, meant, jnp.maximum(SPREAD * meant, SPIKE))
+    prior = PriorConfig()
+    worked = before.fixed(region, meant, jnp.maximum(prior.spread * meant, prior.spike))
     return worked.evidence_for(precision, shift) - before.evidence_for(precision, shift)
 
 

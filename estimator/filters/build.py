@@ -1,51 +1,82 @@
-"""The filter that the settings name, for one sheet, and what it believes beforehand."""
+"""The filter that the settings name, for one sheet."""
+
+from typing import Any
 
 from jiggle_mj.observation import Declaration
 
-from ..belief.attachment_belief import AttachmentBelief
 from ..belief.boundary_belief import BoundaryBelief
+from ..belief.prior import prior_belief
 from ..config import EstimatorConfig
 from ..physics.energy import SheetEnergy
 from ..physics.mesh import SheetMesh
 from ..physics.surrogate import surrogate
-from .adam import AdamShooting
-from .evidence import Filter
+from .adam import RATE, AdamShooting
 from .explicit import PRIOR_MEAN, MultipleShooting
+from .filter import Filter
 from .force_balance import ForceBalance
-from .implicit import ImplicitFilter, prior_belief
+from .implicit import ImplicitFilter
 from .nnls import NonNegativeLeastSquares
+from .shots import simulator
 from .unscented import ReducedUnscented
 
 FORCE_LEVEL = 0.07
-"""Forces meeting at a particle, summed, of which the model gets `EstimatorConfig.force_sd` wrong [k x spacing]; its
-default is 0.064 of them."""
+"""Sum of the forces that meet at a particle for which `EstimatorConfig.force_sd` is the model's force error
+[k x spacing]; the default error is 0.064 of it."""
+TOLERANCE = 1 / 4
+"""Residual force at which the unscented filter's equilibria are found [standard deviation of the force error]."""
 
 
-def build_filter(
-    mesh: SheetMesh, declaration: Declaration, config: EstimatorConfig
-) -> tuple[Filter, BoundaryBelief | AttachmentBelief]:
-    """A filter and its prior; shares in the settings become stiffnesses of the declared membrane."""
+def build_filter(mesh: SheetMesh, declaration: Declaration, config: EstimatorConfig) -> Filter[Any]:
+    """Return the filter that `config.filter` names, with its prior.
+
+    Args:
+        mesh: the sheet.
+        declaration: stiffnesses in the settings are shares of its membrane stiffness k.
+        config: the settings.
+    """
     k = declaration.membrane_stiffness
     energy = surrogate(mesh, declaration, membrane=config.membrane)
     if config.filter == "implicit":
         balance = force_balance(mesh, energy, declaration, config)
-        return ImplicitFilter(balance), prior_belief(mesh, reference=float(balance.reference))
+        prior = prior_belief(mesh, reference=float(balance.reference), config=config.prior)
+        return ImplicitFilter(declared_balance=balance, prior=prior, sampling=config.sampling)
+    prior_sd, grip_stiffness = config.prior_sd * k, config.grip_stiffness * k
     mean = PRIOR_MEAN if config.filter == "explicit" else 0.0
-    gaussian = BoundaryBelief.prior(mesh.n, mean=mean, sd=config.prior_sd * k)
-    if config.filter in ("explicit", "adam"):
-        shooting = MultipleShooting if config.filter == "explicit" else AdamShooting
-        return shooting(mesh, declaration, grip_stiffness=config.grip_stiffness * k, samples=config.samples), gaussian
-    grip_stiffness, force_sd = config.grip_stiffness * k, config.force_sd * k * mesh.spacing
+    prior = BoundaryBelief.prior(mesh.n, mean=mean, sd=prior_sd)
+    if config.filter == "explicit":
+        return MultipleShooting(
+            prior=prior,
+            prior_sd=prior_sd,
+            simulator=simulator(mesh, declaration),
+            grip_stiffness=grip_stiffness,
+            samples=config.samples,
+        )
+    if config.filter == "adam":
+        return AdamShooting(
+            prior=prior,
+            prior_sd=prior_sd,
+            simulator=simulator(mesh, declaration),
+            grip_stiffness=grip_stiffness,
+            samples=config.samples,
+            rate=RATE * k,
+        )
+    force_sd = config.force_sd * k * mesh.spacing
     if config.filter == "nnls":
-        return NonNegativeLeastSquares.build(energy, force_sd=force_sd), gaussian
-    tolerance = force_sd / 4
-    return ReducedUnscented(mesh, energy, grip_stiffness=grip_stiffness, force_tolerance=tolerance), gaussian
+        return NonNegativeLeastSquares.build(energy, prior=prior, prior_sd=prior_sd, force_sd=force_sd)
+    return ReducedUnscented.build(
+        mesh,
+        energy,
+        prior=prior,
+        prior_sd=prior_sd,
+        grip_stiffness=grip_stiffness,
+        force_tolerance=TOLERANCE * force_sd,
+    )
 
 
 def force_balance(
     mesh: SheetMesh, energy: SheetEnergy, declaration: Declaration, config: EstimatorConfig
 ) -> ForceBalance:
-    """The balance of forces of a declared sheet, with an energy for its mesh."""
+    """Return the balance of forces of a declared sheet, with an energy for its mesh."""
     k = declaration.membrane_stiffness
     return ForceBalance.build(
         mesh,
@@ -55,4 +86,5 @@ def force_balance(
         force_level=FORCE_LEVEL * k * mesh.spacing,
         anchor_sd=config.anchor_sd,
         grip_stiffness=config.grip_stiffness * k,
+        config=config.linearisation,
     )

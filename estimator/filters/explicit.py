@@ -6,66 +6,88 @@ for k samples m, the latest and others since the last cut or suture, with J = df
 
     S = J Sigma J^T + blkdiag(V),  K = Sigma J^T S^-1,  mean += K (x_ref - x_pred),  Sigma = (I - K J) Sigma
 
-Computed in the information form, which is the same.
+It is computed in information form, which is equivalent.
 
-Where the paper has a slip or says nothing:
+Differences from the paper, and choices where it gives nothing:
 
-- Its stacked samples have one noise that is common to all (R = [I ... I]), which no sensor has; V is block-diagonal.
-- An old sample that is drawn again is counted again, as in the paper.
-- f and J are taken at the non-negative mean, since f has no meaning at b < 0; the innovation counts from there, so
-  x_pred = f(b) + J (mean - b). Comparing f(b) with what belongs to the mean lets b < 0 run away.
-- Noise in x_m is ignored, as in the paper, whose simulated x_m has none.
-- Neither the stiffness of bending nor step nor sweeps are stated; see `shots`. Nor is Sigma_0.
+- The paper's stacked samples share one common noise (R = [I ... I]), which no sensor has. Here V is block-diagonal.
+- As in the paper, an old sample that is drawn again counts again.
+- f and J are taken at the non-negative mean, since f has no meaning at b < 0. The innovation counts from there:
+  x_pred = f(b) + J (mean - b). To compare f(b) with what belongs to the mean would let b < 0 diverge.
+- As in the paper, whose simulated x_m has no noise, noise in x_m is ignored.
+- The paper gives neither bending stiffness nor time step nor sweeps (see `shots`), nor Sigma_0.
 """
+
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from jiggle_mj.observation import Declaration
+from jiggle_mj.options import FilterName
 
 from ..belief.boundary_belief import BoundaryBelief, entropy, standard_deviations
-from ..physics.mesh import SheetMesh
 from ..physics.xpbd import XPBD
-from .evidence import Evidence, Filter, Update, unavailable
-from .shots import SWEEPS, ShotHistory, Shots, predicted, simulator, slopes
+from .evidence import Evidence
+from .filter import FilterState, GaussianFilter
+from .posterior_summary import Convergence, Update, are_finite, unavailable
+from .shots import SWEEPS, ShotHistory, Shots, predicted, slopes
 
 PRIOR_MEAN = 1e-4
 """The paper's mu_0 [N/m]."""
 
 
-class MultipleShooting(Filter):
-    """The filter for one sheet, with the samples so far."""
+class ShootingState(FilterState):
+    """The belief, and the samples of the trajectory since the last cut or suture."""
 
-    def __init__(self, mesh: SheetMesh, declaration: Declaration, *, grip_stiffness: float, samples: int) -> None:
-        """Build the simulator.
+    history: ShotHistory
+    """Samples that an update may draw."""
 
-        Args:
-            mesh: the sheet.
-            declaration: its membrane stiffness and areal density are used.
-            grip_stiffness: of the springs to the tip [N/m].
-            samples: k.
-        """
-        self._simulator = simulator(mesh, declaration)
-        self._history = ShotHistory(grip_stiffness=grip_stiffness, samples=samples)
 
-    def forget(self) -> None:
-        """After a cut or suture: draw no step from before it."""
-        self._history.forget()
+class MultipleShooting(GaussianFilter[ShootingState]):
+    """The paper's filter for one sheet."""
+
+    simulator: XPBD
+    """f; see `shots.simulator`."""
+    grip_stiffness: float
+    """Stiffness of the springs to the tip [N/m]."""
+    samples: int
+    """k, the samples of each update."""
+
+    @property
+    def name(self) -> FilterName:
+        """See `Filter.name`."""
+        return "explicit"
+
+    def init(self, key: PRNGKeyArray) -> ShootingState:
+        """See `Filter.init`."""
+        return ShootingState(
+            summary=self.init_summary(),
+            release_convergence=Convergence.CONVERGED.code,
+            changes=(),
+            key=key,
+            history=ShotHistory.empty(key),
+        )
+
+    def forget(self, state: ShootingState) -> ShootingState:
+        """Return the state after a cut or suture: no step from before is drawn."""
+        return replace(state, history=state.history.forgotten())
 
     def update(
-        self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
-    ) -> Update:
-        """Take one frame and k - 1 earlier ones into the belief; start is not used."""
-        belief, factor, nis = update(self._simulator, belief, b, self._history.add(evidence), sweeps=SWEEPS)
-        b = non_negative(belief, b)
-        if not (np.isfinite(factor).all() and np.isfinite(nis)):
-            self._history.reject()
+        self, state: ShootingState, evidence: Evidence, start: Float[Array, "n 3"]
+    ) -> tuple[ShootingState, Update]:
+        """See `Filter.update`; one frame and k - 1 earlier ones enter the belief, and start is not used."""
+        before = state.summary.belief
+        assert isinstance(before, BoundaryBelief)
+        history, shots = state.history.with_step(evidence, grip_stiffness=self.grip_stiffness).draw(self.samples)
+        belief, factor, nis = update(self.simulator, before, state.summary.b, shots, sweeps=SWEEPS)
+        b = non_negative(belief, state.summary.b)
+        usable = are_finite(factor, nis)
+        if not usable:
             b = unavailable(b)
-        return Update(
+        outcome = Update(
             belief=belief,
             x=evidence.y,
             b=b,
@@ -73,39 +95,49 @@ class MultipleShooting(Filter):
             probability=unavailable(b),
             entropy=entropy(factor),
             nis=nis,
-            converged=jnp.asarray(True),
+            convergence=Convergence.CONVERGED.code,
         )
+        if not (usable and outcome.explains_the_frame):
+            return replace(state, history=history.without_latest()), outcome
+        return replace(state, summary=outcome, history=history), outcome
 
 
 @eqx.filter_jit
 def update(
     simulator: XPBD, belief: BoundaryBelief, b: Float[Array, " n"], shots: Shots, *, sweeps: int
 ) -> tuple[BoundaryBelief, Float[Array, "n n"], Float[Array, ""]]:
-    """The belief after all samples at once, its precision's Cholesky factor, and the squared innovation per dof.
+    """Return the belief after all samples together, the Cholesky factor of its precision, and the NIS.
 
-    `b` is where f is linearised [N/m].
+    The NIS is the squared innovation per degree of freedom.
+
+    Args:
+        simulator: f.
+        belief: before the frame.
+        b: where f is linearised [N/m].
+        shots: the samples.
+        sweeps: Gauss-Seidel sweeps of f.
     """
-    ahead = belief.mean() - b
+    beyond = belief.mean() - b
 
-    def one(shot: Shots):
+    def evidence_of(shot: Shots):
         def f(b):
             return predicted(simulator, shot, b, sweeps=sweeps)
 
-        slope = slopes(f, b)
-        weighted = jnp.einsum("ani,nij->anj", slope, shot.precision)
-        innovation = shot.end - f(b) - jnp.einsum("ani,a->ni", slope, ahead)
-        squared = jnp.einsum("ni,nij,nj->", innovation, shot.precision, innovation)
-        return jnp.einsum("ani,bni->ab", weighted, slope), jnp.einsum("ani,ni->a", weighted, innovation), squared
+        J = slopes(f, b)
+        weighted = jnp.einsum("ani,nij->anj", J, shot.precision)
+        innovation = shot.end - f(b) - jnp.einsum("ani,a->ni", J, beyond)
+        chi2 = jnp.einsum("ni,nij,nj->", innovation, shot.precision, innovation)
+        return jnp.einsum("ani,bni->ab", weighted, J), jnp.einsum("ani,ni->a", weighted, innovation), chi2
 
-    gained, pulled, squared = (jnp.sum(part, axis=0) for part in jax.lax.map(one, shots))
-    after = belief.add(gained, pulled + gained @ (b + ahead))
+    precision, score, chi2 = (jnp.sum(part, axis=0) for part in jax.lax.map(evidence_of, shots))
+    after = belief.add(precision, score + precision @ (b + beyond))
     factor = jnp.linalg.cholesky(after.precision)
-    explained = pulled @ cho_solve((factor, True), pulled)
+    explained = score @ cho_solve((factor, True), score)
     observed = 3 * jnp.sum(jnp.trace(shots.precision, axis1=2, axis2=3) > 0)
-    return after, factor, (squared - explained) / jnp.maximum(observed, 1).astype(b.dtype)
+    return after, factor, (chi2 - explained) / jnp.maximum(observed, 1).astype(b.dtype)
 
 
 @eqx.filter_jit
 def non_negative(belief: BoundaryBelief, b: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The constrained mean, sought from b."""
+    """Return the mean under b >= 0 [N/m], searched from b."""
     return belief.non_negative_mean(b > 0)

@@ -1,260 +1,312 @@
 """Our filter: each frame's balance of forces is evidence about the bounded stiffness s of every attachment.
 
-A frame is linearised at the belief of its time and added to it (`force_balance`, `attachment_belief`). A stiff
-attachment shows only once its surroundings are believed stiff: when the jaws open, grasps that were linearised far from
-what is believed now are linearised again, and replace what they said before. Nothing is counted twice.
+A frame is linearised at the belief of its time, and its evidence is added to the belief (`force_balance`,
+`attachment_belief`). A stiff attachment shows only once its surroundings are believed stiff. So when the jaws open,
+each grasp that was linearised far from the present belief is linearised again, and its new evidence replaces the old.
+Nothing is counted twice.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from jiggle_mj.actions import Cut, Suture
+from jiggle_mj.options import FilterName
 
 from ..belief.attachment_belief import AttachmentBelief
-from ..belief.attachment_prior import AttachmentPrior
-from ..belief.spike_and_slab import SpikeAndSlab
-from ..parallel_map import parallel_map
+from ..belief.topology import Change, after
 from ..physics.energy import SheetEnergy
-from ..physics.mesh import SheetMesh
-from .evidence import Evidence, Filter, PosteriorSummary, Update
-from .force_balance import Fit, ForceBalance, Frame, FrameInformation
-from .noise import ForceResiduals, Noise
-
-SPIKE = 3e-4
-"""Width of s where free."""
-COMPONENTS, SPREAD, DIRICHLET_STRENGTH = tuple(0.003 * 10 ** (i / 4) for i in range(11)), 0.3, 3.0
-"""Of s where attached, from hardly felt to rigid; their relative widths; see `SpikeAndSlab.dirichlet_strength`."""
-PARTIAL = 0.4
-"""Share of attached particles that have a part of an attachment, as at a border: what two meshes make of the shipped
-scenes."""
-PROBABILITY, COUPLING = 0.047, 1.0
-"""Of being attached without attached neighbours, and what each adds to the log odds: three of an inner particle's six
-make it even, so that a free and an attached stretch are equally likely beforehand. A little more of either, and samples
-find everything attached where little is known, or nothing."""
-BURN_IN, PASSING, SAMPLES = 3, (3, 1), (20, 3)
-"""Rounds of samples when the jaws open: left out, and see `Sampler.run`, how many and how often as many again as all so
-far at most, in passing and at the end."""
-STALE = 0.1
-"""A grasp is linearised again when some s has moved further than this from where it was."""
-FELT = 3e-3
-"""The same, before the noise is judged by what a grasp leaves unexplained: the softest attachment's s."""
-SWEEPS = 10
-"""Over a belief after something was cut or sewn."""
-PASSES = 3
-"""Over stale grasps, and over noises, at most, when the jaws open."""
+from .config import FilterConfig, SamplingConfig
+from .evidence import Evidence
+from .filter import FilterState, ForceBalanceFilter, Region
+from .force_balance import ForceBalance
+from .frame import Frame, FrameInformation
+from .grasp import Grasp, linearise
+from .noise import Noise
+from .posterior_summary import Convergence, PosteriorSummary, Update, prior_summary
 
 
-class ImplicitFilter(Filter):
-    """The filter for one sheet, with the grasps so far."""
+class ImplicitState(FilterState):
+    """The belief, and the frames that it may linearise again."""
 
-    def __init__(self, balance: ForceBalance) -> None:
-        """Take the sheet's balance of forces."""
-        self._balance = balance
-        self._grasps: list[_Grasp] = []
-        self._between, self._due = True, False
-        self._noise = Noise()
-        self._kept: tuple[Any, Any] = 0.0, 0.0
+    balance: ForceBalance
+    """The balance of forces with the assumed noise, and with the sheet's parameters as identified so far."""
+    noise: Noise
+    """Factors on the assumed variances, as learned so far."""
+    grasps: tuple[Grasp, ...]
+    """The grasps since the last cut or suture."""
+    earlier_precision: Float[Array, "n n"]
+    """Precision of s by the frames before the last cut or suture, which are not linearised again."""
+    earlier_shift: Float[Array, " n"]
+    """Their information vector."""
+    between_grasps: bool
+    """Whether the jaws have opened since the last frame."""
+    thorough_due: bool
+    """Whether the last release was not thorough."""
 
     @property
-    def noise(self) -> Noise:
-        """See `Filter.noise`."""
-        return self._noise
+    def belief(self) -> AttachmentBelief:
+        """The latest belief over the attachments."""
+        belief = self.summary.belief
+        assert isinstance(belief, AttachmentBelief)
+        return belief
+
+    @property
+    def evidence(self) -> tuple[Float[Array, "n n"], Float[Array, " n"]] | None:
+        """Precision and information vector of s by the frames since the last cut or suture; None if there are none."""
+        if not self.grasps:
+            return None
+        precision, shift = self.grasps[0].precision, self.grasps[0].shift
+        for grasp in self.grasps[1:]:
+            precision, shift = precision + grasp.precision, shift + grasp.shift
+        return precision, shift
+
+    @property
+    def learned_noise(self) -> Noise:
+        """The noise that the residuals of the grasps ask for; the same object where that is the present one."""
+        residuals = [grasp.residuals for grasp in self.grasps if grasp.residuals is not None]
+        return self.noise.learned(residuals) if residuals else self.noise
+
+
+class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
+    """The filter for one sheet."""
+
+    declared_balance: ForceBalance
+    """The balance of forces with the assumed noise and the declared parameters."""
+    prior: AttachmentBelief
+    """Belief before the first frame."""
+    sampling: SamplingConfig = eqx.field(static=True, default=SamplingConfig())
+    """Numbers of samples."""
+    learns_noise: bool = eqx.field(static=True, default=True)
+    """Whether residuals may inflate the assumed noise; False keeps it as it is."""
+
+    @property
+    def name(self) -> FilterName:
+        """See `Filter.name`."""
+        return "implicit"
+
+    @property
+    def config(self) -> FilterConfig:
+        """Numbers of the linearisation."""
+        return self.declared_balance.config
+
+    def init(self, key: PRNGKeyArray) -> ImplicitState:
+        """See `Filter.init`."""
+        n = len(self.prior.shift)
+        return ImplicitState(
+            summary=prior_summary(self.prior, n),
+            release_convergence=Convergence.CONVERGED.code,
+            changes=(),
+            key=key,
+            balance=self.declared_balance,
+            noise=Noise(),
+            grasps=(),
+            earlier_precision=jnp.zeros((n, n)),
+            earlier_shift=jnp.zeros(n),
+            between_grasps=True,
+            thorough_due=False,
+        )
 
     def update(
-        self, belief: AttachmentBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
-    ) -> Update:
-        """See `Filter.update`."""
-        s = belief.bounded(b)
-        noisy = evidence.widened(self._noise.position)
-        frame, _, found = _seen(self.balance, _settled(self.balance, start, s, noisy), s, noisy)
-        update = _believed(self.balance, belief, frame, found, noisy)
-        if np.isfinite(update.x).all() and np.isfinite(update.b).all():
-            if self._between:
-                self._grasps.append(_Grasp())
-            self._grasps[-1].take(evidence, update.x, found)
-            self._between = False
-        return update
+        self, state: ImplicitState, evidence: Evidence, start: Float[Array, "n 3"]
+    ) -> tuple[ImplicitState, Update]:
+        """See `Filter.update`: settle the sheet near what was seen, linearise there, add the evidence, sweep once."""
+        s, balance = state.belief.bounded(state.summary.b), self.balance(state)
+        inflated = evidence.inflated(state.noise.position)
+        frame, _, information = linearise(balance, _settled(balance, start, s, inflated), s, inflated)
+        update = _updated(balance, state.belief, frame, information, inflated)
+        if not update.explains_the_frame:
+            return state, update
+        *before, last = (*state.grasps, Grasp.empty(len(s))) if state.between_grasps else state.grasps
+        grasps = (*before, last.with_frame(evidence, update.x, information))
+        return replace(state, summary=update, grasps=grasps, between_grasps=False), update
 
-    def reconsider(self, belief: AttachmentBelief) -> PosteriorSummary:
-        """See `Filter.reconsider`: as few samples give it, which find most of what propagation misses in a grasp."""
-        return reconsidered(belief)
+    def resample(self, state: ImplicitState) -> ImplicitState:
+        """See `Filter.resample`: few samples find most of what propagation misses within a grasp."""
+        return replace(state, summary=self._quick(state, state.belief))
 
-    def release(self, belief: AttachmentBelief, *, thorough: bool = True) -> PosteriorSummary | None:
-        """The belief with all grasps linearised again that need it; the next frame begins another grasp.
+    def release(self, state: ImplicitState, *, thorough: bool = True) -> tuple[ImplicitState, PosteriorSummary | None]:
+        """See `Filter.release`: linearise each grasp again that needs it; the next frame begins another grasp.
 
-        In passing the noise is not judged, and few samples have to do.
+        A release that is not thorough draws few samples and does not learn the noise.
         """
-        if self._between and not (thorough and self._due):
-            return None
-        self._between, self._due = True, not thorough
-        return self._refined(belief) if thorough else self._settled(_sampled(belief, PASSING), STALE, 1)
+        if state.between_grasps and not (thorough and state.thorough_due):
+            return state, None
+        state = replace(state, between_grasps=True, thorough_due=not thorough)
+        if thorough:
+            return self._refined(state)
+        summary = self._quick(state, state.belief)
+        return _with_release(*self._relinearised(state, summary, self.config.relinearise_beyond, 1))
 
-    def restart(self, belief: AttachmentBelief) -> PosteriorSummary:
-        """Keep a belief as it is: no frame from before is judged again. The next one begins another grasp."""
-        self._between, self._grasps, self._kept = True, [], (belief.precision, belief.shift)
-        return _swept(belief)
+    def change(self, state: ImplicitState, event: Cut | Suture, *, region: Region, index: int) -> ImplicitState:
+        """See `Filter.change`; the next frame begins another grasp, and no frame from before is linearised again."""
+        changes = state.changes
+        if changes:
+            changes = (*changes[:-1], replace(changes[-1], evidence=state.evidence))
+        belief = after(state.belief, event, region)
+        return replace(
+            state,
+            summary=_swept(belief, self.config.change_sweeps),
+            changes=(*changes, Change(event=event, index=index, region=region, before=state.belief)),
+            grasps=(),
+            earlier_precision=belief.precision,
+            earlier_shift=belief.shift,
+            between_grasps=True,
+        )
 
-    def evidence(self) -> tuple[Float[Array, "n n"], Float[Array, " n"]] | None:
-        """What the frames since `restart`, or all frames, say of s, in information form; None before the first."""
-        return self._total() if self._grasps else None
+    def log_bayes_factor(self, state: ImplicitState, change: Change) -> float | None:
+        """See `ForceBalanceFilter.log_bayes_factor`."""
+        is_latest = bool(state.changes) and change.before is state.changes[-1].before
+        stored = next((stored for stored in state.changes if stored.before is change.before), change)
+        evidence = state.evidence if is_latest else stored.evidence
+        return None if evidence is None else change.log_bayes_factor(*evidence)
 
-    def of(self, belief: AttachmentBelief, energy: SheetEnergy) -> PosteriorSummary:
-        """All grasps so far judged again by another energy of the same sheet, the noise learned anew."""
-        self._balance, self._noise = self._balance.of(energy), Noise()
-        for grasp in self._grasps:
-            grasp.noise = None
-        return self._refined(belief)
+    def noise(self, state: ImplicitState) -> Noise:
+        """See `Filter.noise`."""
+        return state.noise
 
-    @property
-    def energy(self) -> SheetEnergy:
-        """Of the sheet without attachments."""
-        return self._balance.energy
+    def balance(self, state: ImplicitState) -> ForceBalance:
+        """See `ForceBalanceFilter.balance`."""
+        return state.balance.inflated(state.noise.force)
 
-    @property
-    def balance(self) -> ForceBalance:
-        """Of forces, with the noise that was learned."""
-        return self._balance.widened(self._noise.force)
+    def belief(self, state: ImplicitState) -> AttachmentBelief:
+        """See `ForceBalanceFilter.belief`."""
+        return state.belief
 
-    def frames(self) -> Iterator[tuple[ForceBalance, Evidence, Float[Array, "n 3"]]]:
-        """What was seen so far, with the noise that was learned, and the states found; by which balance."""
-        for grasp in self._grasps:
-            for evidence, x, _ in grasp.frames:
-                yield self.balance, evidence.widened(self._noise.position), x
+    def frames(self, state: ImplicitState) -> Iterator[tuple[Evidence, Float[Array, "n 3"]]]:
+        """See `ForceBalanceFilter.frames`."""
+        for grasp in state.grasps:
+            for frame in grasp.frames:
+                yield frame.evidence.inflated(state.noise.position), frame.x
 
-    def _refined(self, belief: AttachmentBelief) -> PosteriorSummary:
-        summary = self._settled(_sampled(belief, PASSING), STALE, PASSES)
-        for _ in range(PASSES):
-            if self._learned() == self._noise:
+    def refit(self, state: ImplicitState, energy: SheetEnergy) -> tuple[ImplicitState, PosteriorSummary]:
+        """See `ForceBalanceFilter.refit`."""
+        grasps = tuple(replace(grasp, noise=None) for grasp in state.grasps)
+        return self._refined(replace(state, balance=state.balance.with_energy(energy), noise=Noise(), grasps=grasps))
+
+    def _refined(self, state: ImplicitState) -> tuple[ImplicitState, PosteriorSummary]:
+        """Linearise stale grasps again, learn the noise from their residuals, repeat; then draw many samples."""
+        config = self.config
+        summary = self._quick(state, state.belief)
+        state, summary = self._relinearised(state, summary, config.relinearise_beyond, config.max_passes)
+        for _ in range(config.max_passes):
+            if not self.learns_noise or state.learned_noise is state.noise:
                 break
-            summary = self._settled(summary, FELT, 1)
-            self._noise = self._learned()
-            summary = self._settled(summary, STALE, PASSES)
-        return _sampled(summary.belief, SAMPLES)
+            state, summary = self._relinearised(state, summary, config.relinearise_for_noise_beyond, 1)
+            state = replace(state, noise=state.learned_noise)
+            state, summary = self._relinearised(state, summary, config.relinearise_beyond, config.max_passes)
+        belief = summary.belief
+        assert isinstance(belief, AttachmentBelief)
+        return _with_release(state, sampled(belief, state.key, self.sampling.thorough, self.sampling))
 
-    def _settled(self, summary: PosteriorSummary, far: float, passes: int) -> PosteriorSummary:
-        """After grasps that were linearised further than `far` from what is believed were linearised again."""
+    def _relinearised(
+        self, state: ImplicitState, summary: PosteriorSummary, beyond: float, passes: int
+    ) -> tuple[ImplicitState, PosteriorSummary]:
+        """Linearise stale grasps again, and draw a few samples after each pass.
+
+        A grasp is stale if some s has moved by more than `beyond`, or the noise has changed, since its linearisation.
+        There are at most `passes` passes.
+        """
         for _ in range(passes):
             belief = summary.belief
             assert isinstance(belief, AttachmentBelief)
             s = belief.bounded(summary.b)
-            stale = [grasp.noise != self._noise or grasp.distance(s) > far for grasp in self._grasps]
+            stale = [grasp.noise != state.noise or grasp.distance(s) > beyond for grasp in state.grasps]
             if not any(stale):
                 break
-            self._grasps = [
-                grasp.again(self._balance, s, self._noise) if old else grasp
-                for grasp, old in zip(self._grasps, stale, strict=True)
-            ]
-            total = tuple(kept + new for kept, new in zip(self._kept, self._total(), strict=True))
-            belief = eqx.tree_at(lambda one: (one.precision, one.shift), belief, total)
-            summary = _sampled(belief, PASSING)
-        return summary
+            grasps = tuple(
+                grasp.relinearised(state.balance, s, state.noise) if is_stale else grasp
+                for grasp, is_stale in zip(state.grasps, stale, strict=True)
+            )
+            state = replace(state, grasps=grasps)
+            evidence = state.evidence
+            assert evidence is not None
+            total = state.earlier_precision + evidence[0], state.earlier_shift + evidence[1]
+            belief = eqx.tree_at(lambda belief: (belief.precision, belief.shift), belief, total)
+            summary = self._quick(state, belief)
+        return state, summary
 
-    def _total(self) -> tuple[Any, Any]:
-        """What all grasps say together."""
-        return sum(grasp.precision for grasp in self._grasps), sum(grasp.shift for grasp in self._grasps)
-
-    def _learned(self) -> Noise:
-        return self._noise.learned([grasp.misfit for grasp in self._grasps if grasp.misfit is not None])
-
-
-def prior_belief(mesh: SheetMesh, *, reference: float) -> AttachmentBelief:
-    """The prior of a sheet, with b_ref = reference [N/m]."""
-    stiffness = SpikeAndSlab.build(
-        spike=SPIKE, components=COMPONENTS, spread=SPREAD, dirichlet_strength=DIRICHLET_STRENGTH, partial=PARTIAL
-    )
-    prior = AttachmentPrior.build(mesh.n, mesh.edges, stiffness=stiffness, probability=PROBABILITY, coupling=COUPLING)
-    return AttachmentBelief.before(prior, reference=reference)
+    def _quick(self, state: ImplicitState, belief: AttachmentBelief) -> PosteriorSummary:
+        """Return the posterior by a few samples."""
+        return sampled(belief, state.key, self.sampling.quick, self.sampling)
 
 
-def reconsidered(belief: AttachmentBelief) -> PosteriorSummary:
-    """The belief as a few samples give it."""
-    return _sampled(belief, PASSING)
+def sampled(
+    belief: AttachmentBelief, key: PRNGKeyArray, rounds: tuple[int, int], config: SamplingConfig
+) -> PosteriorSummary:
+    """Return the posterior by samples.
+
+    Drawn on a CPU where JAX has one: samples follow one another, and a GPU takes ten times as long.
+
+    Args:
+        belief: what to draw from.
+        key: of the draws.
+        rounds: rounds of samples, and how often they may be doubled.
+        config: how many are drawn first and not averaged.
+    """
+    with jax.default_device(_cpus()[0]):
+        return _sampled(belief, key, *map(jnp.asarray, rounds), burn_in=config.burn_in)
 
 
-@eqx.filter_jit
-def likeliest(belief: AttachmentBelief) -> Float[Array, " n"]:
-    """S of the attachments that are likeliest together."""
-    return belief.mode(jax.random.key(0))
-
-
-class _Grasp:
-    """The frames between closing and opening the jaws, and what they say together."""
-
-    def __init__(self, noise: Noise | None = None) -> None:
-        """Of no frames yet; `noise` is None while frames come in, each linearised for the belief of its time."""
-        self.noise = noise
-        self.precision: Float[Array, "n n"] | float = 0.0
-        self.shift: Float[Array, " n"] | float = 0.0
-        self.misfit: ForceResiduals | None = None
-        """What they leave unexplained, if they were linearised again."""
-        self.frames: list[tuple[Evidence, Float[Array, "n 3"], Float[Array, " n"]]] = []
-        """What was seen, the state, and the s of the linearisation."""
-
-    def take(self, evidence: Evidence, x: Float[Array, "n 3"], found: FrameInformation) -> None:
-        self.frames.append((evidence, x, found.at))
-        self.precision, self.shift = self.precision + found.precision, self.shift + found.shift
-
-    def distance(self, s: Float[Array, " n"]) -> float:
-        """How far s is from where a frame was linearised."""
-        return max(float(jnp.max(jnp.abs(s - at))) for _, _, at in self.frames)
-
-    def again(self, balance: ForceBalance, s: Float[Array, " n"], noise: Noise) -> "_Grasp":
-        """The same frames, linearised at s for a noise."""
-        grasp, balance = _Grasp(noise), balance.widened(noise.force)
-
-        def one(k: int) -> tuple[Float[Array, "n 3"], FrameInformation, ForceResiduals]:
-            evidence, x, _ = self.frames[k]
-            noisy = evidence.widened(noise.position)
-            frame, fit, found = _seen(balance, x, s, noisy)
-            return frame.x, found, _misfit(balance, frame, fit, noisy)
-
-        for k, (x, found, misfit) in parallel_map(one, range(len(self.frames))).items():
-            grasp.take(self.frames[k][0], x, found)
-            grasp.misfit = misfit if grasp.misfit is None else grasp.misfit + misfit
-        return grasp
-
-
-_settled, _misfit = eqx.filter_jit(ForceBalance.settle), eqx.filter_jit(ForceBalance.misfit)
+def quick_summary(belief: AttachmentBelief, *, seed: int = 0, config: SamplingConfig | None = None) -> PosteriorSummary:
+    """Return the posterior by a few samples."""
+    config = config or SamplingConfig()
+    return sampled(belief, jax.random.key(seed), config.quick, config)
 
 
 @eqx.filter_jit
-def _seen(
-    balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
-) -> tuple[Frame, Fit, FrameInformation]:
-    """What a frame says, from a state nearby."""
-    frame = balance.approach(x, s, evidence)
-    fit = balance.fit(frame)
-    return frame, fit, balance.information(frame, fit)
+def likeliest(belief: AttachmentBelief, *, seed: int = 0) -> Float[Array, " n"]:
+    """Return the s of the attachments that are likeliest together."""
+    return belief.mode(jax.random.key(seed))
+
+
+_settled = eqx.filter_jit(ForceBalance.settle)
+
+
+def _with_release(state: ImplicitState, summary: PosteriorSummary) -> tuple[ImplicitState, PosteriorSummary]:
+    """Take a posterior into the state if it is finite."""
+    if summary.is_finite:
+        state = replace(state, summary=summary, release_convergence=summary.convergence)
+    return state, summary
 
 
 @eqx.filter_jit
-def _believed(
-    balance: ForceBalance, belief: AttachmentBelief, frame: Frame, found: FrameInformation, evidence: Evidence
+def _updated(
+    balance: ForceBalance, belief: AttachmentBelief, frame: Frame, information: FrameInformation, evidence: Evidence
 ) -> Update:
-    """The belief with what a frame says, and the state by it."""
-    belief = belief.add(found.precision, found.shift)
+    """Return the belief after a frame's evidence, and the state for it."""
+    belief = belief.add(information.precision, information.shift)
     gaussian = belief.gaussian()
-    nis = _normalised_innovation(found, gaussian.factor, evidence)
+    nis = _normalised_innovation(information, gaussian.factor, evidence)
     belief = belief.sweep(gaussian)
-    summary = _summary(belief, frame.converged)
+    summary = _summary(belief, Convergence.SEARCH_CUT_OFF.unless(frame.converged))
     x = balance.polish(frame, belief.bounded(summary.b), evidence)
     return Update(**vars(summary), x=x, nis=nis)
 
 
 @eqx.filter_jit
-def _swept(belief: AttachmentBelief) -> PosteriorSummary:
-    return _summary(belief.swept(SWEEPS), jnp.asarray(True))
+def _swept(belief: AttachmentBelief, sweeps: int) -> PosteriorSummary:
+    """Return the posterior after sweeps of expectation propagation."""
+    return _summary(belief.swept(sweeps), Convergence.CONVERGED.code)
 
 
-def _sampled(belief: Any, rounds: tuple[int, int]) -> PosteriorSummary:
-    """On a CPU where JAX has one: samples follow one another, and a GPU takes ten times as long."""
-    with jax.default_device(_cpus()[0]):
-        return _state_sampled(belief, *map(jnp.asarray, rounds))
+@eqx.filter_jit
+def _sampled(
+    belief: AttachmentBelief,
+    key: PRNGKeyArray,
+    rounds: Int[Array, ""],
+    doublings: Int[Array, ""],
+    *,
+    burn_in: int,
+) -> PosteriorSummary:
+    after_samples, agree = belief.sampled(key, burn_in=burn_in, rounds=rounds, doublings=doublings)
+    return _summary(after_samples, Convergence.SAMPLES_DISAGREE.unless(agree))
 
 
 def _cpus() -> list[Any]:
@@ -264,16 +316,12 @@ def _cpus() -> list[Any]:
         return jax.devices()
 
 
-@eqx.filter_jit
-def _state_sampled(belief: AttachmentBelief, rounds: Int[Array, ""], doublings: Int[Array, ""]) -> PosteriorSummary:
-    return _summary(*belief.sampled(jax.random.key(0), burn_in=BURN_IN, rounds=rounds, doublings=doublings))
-
-
-def _summary(belief: AttachmentBelief, converged: Bool[Array, ""]) -> PosteriorSummary:
+def _summary(belief: AttachmentBelief, convergence: Int[Array, ""]) -> PosteriorSummary:
+    """Return a belief with each particle's own numbers."""
     posterior = belief.posterior()
     return PosteriorSummary(
         belief=belief,
-        converged=converged,
+        convergence=convergence,
         b=posterior.stiffness,
         sd=posterior.stiffness_sd,
         probability=posterior.attached,
@@ -282,14 +330,14 @@ def _summary(belief: AttachmentBelief, converged: Bool[Array, ""]) -> PosteriorS
 
 
 def _normalised_innovation(
-    found: FrameInformation, factor: Float[Array, "n n"], evidence: Evidence
+    information: FrameInformation, factor: Float[Array, "n n"], evidence: Evidence
 ) -> Float[Array, ""]:
-    """e^T (N + D Sigma D^T)^-1 e per degree of freedom, with Sigma from before the frame and e at the s of then.
+    """Return e^T (N + D Sigma D^T)^-1 e per degree of freedom, Sigma before the frame and e at the s of then.
 
-    By Woodbury's identity e^T N^-1 e - p^T (Sigma^-1 + D^T N^-1 D)^-1 p with p = D^T N^-1 e; `factor` is
-    that of the middle matrix.
+    By Woodbury's identity it is e^T N^-1 e - p^T (Sigma^-1 + D^T N^-1 D)^-1 p with p = D^T N^-1 e; `factor` is the
+    Cholesky factor of the middle matrix.
     """
-    explained = found.pulled @ cho_solve((factor, True), found.pulled)
+    explained = information.score @ cho_solve((factor, True), information.score)
     observed = 3 * jnp.sum(evidence.seen)
     degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.force_unknown), 1)
-    return (found.squared - explained) / degrees.astype(explained.dtype)
+    return (information.chi2 - explained) / degrees.astype(explained.dtype)

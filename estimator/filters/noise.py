@@ -1,37 +1,41 @@
-"""How wrong the model and the measurements are, learned from what they leave unexplained.
+"""Factors on the assumed variances of the model's forces and of the positions, learned from residuals.
 
-What the typed noises allow is a beginning. Given s, a frame's whitened residuals have as many degrees of freedom as the
-fit of its state leaves over,
+The assumed noises are where learning starts. Given s, a frame's whitened residuals z have gamma degrees of freedom:
+those that the fit of its state does not use,
 
     E |z|^2 = gamma = 3 m - tr(fit),
 
-over m particles, and independent frames add up: E |sum_t z_t|^2 = sum_t gamma_t over the frames of one grasp. An error
-that stays the same from frame to frame, as most of what a model lacks, adds up faster, and is worth what its sum is
-worth [MacKay 1992, doi:10.1162/neco.1992.4.3.415, for the degrees of freedom]. Above 1, the ratio of the two is the
-factor by which the variance was too small. Noises are only widened beyond what was typed, never narrowed: the fit of s
-absorbs part of them, and data say little of a noise smaller than the other.
+over m particles. Independent frames add up: E |sum_t z_t|^2 = sum_t gamma_t over the frames of one grasp. An error that
+stays the same from frame to frame, as most of what a model lacks does, adds up faster, and counts by its sum [MacKay
+1992, doi:10.1162/neco.1992.4.3.415, for the degrees of freedom]. A ratio of the two above 1 is the factor by which the
+variance was too small. A variance is only ever inflated above the assumed one, never reduced: the fit of s absorbs part
+of both noises, and data hold little evidence about a noise that is smaller than the other.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+MIN_CHANGE = 1.2
+"""Factor by which a learned variance must change before all frames are linearised again [1]."""
+
 
 class ForceResiduals(eqx.Module):
-    """What is left of one frame, or of the frames of one grasp together; whitened by the noise assumed."""
+    """Residuals of one frame, or their sum over the frames of one grasp, whitened by the assumed noise."""
 
     force: Float[Array, "n 3"]
-    """Unbalanced force, 0 where it is unknown."""
+    """Whitened residual force; 0 where the balance of forces is unknown."""
     force_degrees: Float[Array, ""]
+    """Degrees of freedom of the residual forces."""
     position: Float[Array, "n 3"]
-    """Observed less fitted position, 0 where nothing was seen or the jaws hold."""
+    """Whitened difference of observed and fitted position; 0 where nothing was seen or the jaws hold."""
     position_degrees: Float[Array, ""]
+    """Degrees of freedom of those differences."""
 
     def __add__(self, other: "ForceResiduals") -> "ForceResiduals":
-        """Of both together."""
+        """Return the sum over the frames of both."""
         return ForceResiduals(
             force=self.force + other.force,
             force_degrees=self.force_degrees + other.force_degrees,
@@ -40,30 +44,31 @@ class ForceResiduals(eqx.Module):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Noise:
-    """Factors on the typed variances, from 1 on."""
+class Noise(eqx.Module):
+    """Factors on the assumed variances, 1 or more."""
 
     force: float = 1.0
+    """Factor on the variance of the model's force error [1]."""
     position: float = 1.0
+    """Factor on the variance of the observed positions [1]."""
 
     def learned(self, grasps: Sequence[ForceResiduals]) -> "Noise":
-        """After what this noise left of each grasp; the same object where that is about what it expected."""
-        force = _excess([(one.force, one.force_degrees) for one in grasps])
-        position = _excess([(one.position, one.position_degrees) for one in grasps])
-        found = Noise(force=max(1.0, self.force * force), position=max(1.0, self.position * position))
-        worth = max(_ratio(found.force, self.force), _ratio(found.position, self.position)) > WORTH
-        return found if worth else self
+        """Return the factors that the residuals of each grasp, whitened by this noise, ask for.
+
+        The same object where they are about as large as this noise expects.
+        """
+        force = _excess([(grasp.force, grasp.force_degrees) for grasp in grasps])
+        position = _excess([(grasp.position, grasp.position_degrees) for grasp in grasps])
+        learned = Noise(force=max(1.0, self.force * force), position=max(1.0, self.position * position))
+        change = max(_ratio(learned.force, self.force), _ratio(learned.position, self.position))
+        return learned if change > MIN_CHANGE else self
 
 
 def _excess(grasps: list[tuple[Float[Array, "n 3"], Float[Array, ""]]]) -> float:
-    """Squares of the sums against their degrees of freedom."""
-    return float(sum(jnp.sum(left**2) for left, _ in grasps) / sum(degrees for _, degrees in grasps))
+    """Return the squared sums of residuals over their degrees of freedom."""
+    return float(sum(jnp.sum(residual**2) for residual, _ in grasps) / sum(degrees for _, degrees in grasps))
 
 
-def _ratio(one: float, other: float) -> float:
-    return max(one / other, other / one)
-
-
-WORTH = 1.2
-"""A factor that changes by less is not worth linearising everything again."""
+def _ratio(a: float, b: float) -> float:
+    """Return the larger of two positive numbers over the smaller."""
+    return max(a / b, b / a)

@@ -13,19 +13,21 @@ from ..physics.environment import Tether
 from ..physics.equilibrium import Equilibrium, equilibrium
 from .evidence import Evidence
 
-STEPS = 25
-"""Most Newton steps."""
+MAX_NEWTON_STEPS = 25
+"""Most Newton steps of an equilibrium."""
+MIN_TRACE = 1e-12
+"""Lower bound of the trace of a precision where it divides [1/m^2]: a particle that nothing was seen of."""
 
 
 class Tethered(eqx.Module):
-    """One sheet, to be smoothed frame after frame."""
+    """One sheet on springs, for one frame after the other."""
 
     energy: SheetEnergy
-    """Its last term are the springs."""
+    """Energy of the sheet; its last term is the springs [J]."""
 
     @classmethod
     def build(cls, energy: SheetEnergy) -> "Tethered":
-        """For a sheet's energy without attachments."""
+        """Add the springs to a sheet's energy without attachments."""
         rest = np.asarray(energy.rest)
         return cls(energy=SheetEnergy.build(rest, (*energy.terms, Tether.build(rest)), energy.layout))
 
@@ -39,11 +41,21 @@ class Tethered(eqx.Module):
         force_tolerance: float | Array,
         grip_stiffness: float | Array | None = None,
     ) -> Equilibrium:
-        """Equilibrium with attachments b [N/m], searched from `start`; held particles on springs of their own [N/m]."""
-        sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), 1e-12))
+        """Return the equilibrium of the sheet on springs to what was observed.
+
+        Args:
+            b: stiffness of each attachment [N/m].
+            evidence: what was observed.
+            start: where the search begins [m].
+            force_sd: standard deviation of the model's force error [N]; a particle that is one standard deviation of
+                its position off pulls with this force.
+            force_tolerance: residual force at which the search ends [N].
+            grip_stiffness: of the springs of held particles [N/m]; as those of the others if None.
+        """
+        sd = jnp.sqrt(3 / jnp.maximum(jnp.trace(evidence.precision, axis1=1, axis2=2), MIN_TRACE))
         pull = (force_sd * sd)[:, None, None] * evidence.precision
         if grip_stiffness is not None:
             stiff = grip_stiffness * jnp.eye(3, dtype=start.dtype)
             pull = jnp.where(evidence.held[:, None, None], stiff, pull)
         energy = eqx.tree_at(lambda e: (e.terms[-1].to, e.terms[-1].stiffness), self.energy, (evidence.y, pull))
-        return equilibrium(energy, b, start, force_tolerance=force_tolerance, max_steps=STEPS)
+        return equilibrium(energy, b, start, force_tolerance=force_tolerance, max_steps=MAX_NEWTON_STEPS)

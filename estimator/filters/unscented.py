@@ -3,92 +3,157 @@
 The filter of Moireau & Chapelle (2011, doi:10.1051/cocv/2010006), used as for the stochastic boundary conditions of
 Peterlik et al. (2017, doi:10.1007/978-3-319-66185-8_62).
 
-One stiffness theta a patch of neighbouring particles, b = theta of its patch. With r patches, P = C C^T and the r + 1
-unit simplex points I_j, each frame sends theta_j = theta + C I_j through the equilibrium x*(b, u), with
+One stiffness theta holds for a patch of neighbouring particles: b = theta of its patch. With r patches, P = C C^T and
+the r + 1 points I_j of the unit simplex, each frame sends theta_j = theta + C I_j through the equilibrium x*(b, u):
 
     slope = 1/(r+1) sum_j (x_j - mean x) (C^-T I_j)^T,
     P^-1 += slope^T R^-1 slope,   theta += P slope^T R^-1 (y - mean x),
 
 the simplex form of the filter written for parameters alone. A negative stiffness is simulated as zero, and the
-estimate after a frame is the constrained one. What leaves is the particles' own mean and variance; that particles of a
-patch are one stays in here, so the belief's covariance is diagonal.
+estimate after a frame is the constrained one.
+
+The summary holds the particles' own means and variances only: its covariance is diagonal. That particles of a patch
+share one stiffness is known in `UnscentedState.reduced` alone.
 """
+
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy.cluster.vq import kmeans2
+
+from jiggle_mj.options import FilterName
 
 from ..belief.boundary_belief import BoundaryBelief, entropy, non_negative_minimum
 from ..physics.energy import SheetEnergy
 from ..physics.environment import Grip
 from ..physics.equilibrium import equilibrium
 from ..physics.mesh import SheetMesh
-from .evidence import Evidence, Filter, Update, unavailable
+from .evidence import Evidence
+from .filter import FilterState, GaussianFilter
+from .posterior_summary import Convergence, Update, are_finite, unavailable
 
 PATCHES = 40
-"""r; on 10 cm x 10 cm a patch is 16 mm wide."""
-STEPS = 40
+"""r, the largest number of patches; on 10 cm x 10 cm a patch is 16 mm wide."""
+MIN_PARTICLES = 4
+"""Particles in a patch, on average, at least: a small sheet has fewer patches than `PATCHES`."""
+MAX_NEWTON_STEPS = 40
 """Most Newton steps of an equilibrium."""
+PATCH_SEED = 0
+"""Seed of the k-means that lays the patches: part of the mesh, not of the draws of a filter."""
 
 
-class ReducedUnscented(Filter):
-    """The filter for one sheet, with the reduced state so far."""
+class UnscentedState(FilterState):
+    """The particles' marginals, and the belief over the patches."""
 
-    def __init__(self, mesh: SheetMesh, energy: SheetEnergy, *, grip_stiffness: float, force_tolerance: float) -> None:
-        """Lay the patches.
+    reduced: BoundaryBelief | None
+    """Belief over the stiffness of each patch; None before the first frame."""
+
+
+class ReducedUnscented(GaussianFilter[UnscentedState]):
+    """The filter for one sheet."""
+
+    patch: Int[np.ndarray, " n"]
+    """Patch of each particle."""
+    gripped: SheetEnergy
+    """Energy of the sheet with a grip as its last term."""
+    grip_stiffness: float
+    """Stiffness of the springs to the tip [N/m]."""
+    force_tolerance: float
+    """Residual force at which an equilibrium is found [N]."""
+
+    @classmethod
+    def build(
+        cls,
+        mesh: SheetMesh,
+        energy: SheetEnergy,
+        *,
+        prior: BoundaryBelief,
+        prior_sd: float,
+        grip_stiffness: float,
+        force_tolerance: float,
+    ) -> "ReducedUnscented":
+        """Lay the patches over a sheet.
 
         Args:
             mesh: the sheet.
             energy: of the sheet without attachments and grip.
+            prior: belief before the first frame; only its marginals are used.
+            prior_sd: see `GaussianFilter`.
             grip_stiffness: of the springs to the tip [N/m].
-            force_tolerance: of an equilibrium [N].
+            force_tolerance: residual force at which an equilibrium is found [N].
         """
-        self._patch = patches(mesh.rest, min(PATCHES, mesh.n // 4))
-        self._r = int(self._patch.max()) + 1
-        self._grip_stiffness, self._force_tolerance = grip_stiffness, force_tolerance
         grip = Grip.build(jnp.asarray(mesh.rest), jnp.zeros(3), radius=1.0, stiffness=0.0)
-        self._gripped = SheetEnergy.build(mesh.rest, (*energy.terms, grip), energy.layout)
-        self._state: BoundaryBelief | None = None
+        return cls(
+            prior=prior,
+            prior_sd=prior_sd,
+            patch=patches(mesh.rest, min(PATCHES, mesh.n // MIN_PARTICLES)),
+            gripped=SheetEnergy.build(mesh.rest, (*energy.terms, grip), energy.layout),
+            grip_stiffness=grip_stiffness,
+            force_tolerance=force_tolerance,
+        )
+
+    @property
+    def name(self) -> FilterName:
+        """See `Filter.name`."""
+        return "unscented"
+
+    def init(self, key: PRNGKeyArray) -> UnscentedState:
+        """See `Filter.init`."""
+        return UnscentedState(
+            summary=self.init_summary(),
+            release_convergence=Convergence.CONVERGED.code,
+            changes=(),
+            key=key,
+            reduced=None,
+        )
 
     def update(
-        self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
-    ) -> Update:
-        """See `Filter.update`; of the belief only the first one's marginals are used."""
+        self, state: UnscentedState, evidence: Evidence, start: Float[Array, "n 3"]
+    ) -> tuple[UnscentedState, Update]:
+        """See `Filter.update`; the belief over particles is used before the first frame only."""
         pull = evidence.pull
         if pull is None:
             raise ValueError("the unscented filter needs Evidence.pull, where the tip is; got None.")
-        if self._state is None:
-            mean, covariance = belief.moments()
-            first = jnp.asarray([np.flatnonzero(self._patch == k)[0] for k in range(self._r)])
-            precision = jnp.diag(1 / jnp.diagonal(covariance)[first])
-            self._state = BoundaryBelief(precision=precision, shift=precision @ mean[first])
-        stiff = jnp.where(evidence.held, self._grip_stiffness, 0.0)
+        stiff = jnp.where(evidence.held, self.grip_stiffness, 0.0)
         grip = Grip.of(pull.tip, pull.length, stiff)
-        gripped = eqx.tree_at(lambda energy: energy.terms[-1], self._gripped, grip)
-        patch = jnp.asarray(self._patch)
-        state, x, nis, converged = update(
-            gripped, patch, self._state, evidence, start, force_tolerance=jnp.asarray(self._force_tolerance)
+        gripped = eqx.tree_at(lambda energy: energy.terms[-1], self.gripped, grip)
+        patch, before = jnp.asarray(self.patch), self._reduced(state)
+        reduced, x, nis, converged = update(
+            gripped, patch, before, evidence, start, force_tolerance=jnp.asarray(self.force_tolerance)
         )
-        mean, covariance = state.moments()
-        theta = non_negative_minimum(state.precision, state.shift, mean > 0)
-        if np.isfinite(x).all() and np.isfinite(theta).all():
-            self._state = state
+        mean, covariance = reduced.moments()
+        theta = non_negative_minimum(reduced.precision, reduced.shift, mean > 0)
         variance = jnp.diagonal(covariance)
         marginals = BoundaryBelief(precision=jnp.diag(1 / variance[patch]), shift=(mean / variance)[patch])
-        return Update(
+        outcome = Update(
             belief=marginals,
             x=x,
             b=theta[patch],
             sd=jnp.sqrt(variance[patch]),
-            probability=unavailable(b),
+            probability=unavailable(state.summary.b),
             entropy=entropy(jnp.linalg.cholesky(marginals.precision)),
             nis=nis,
-            converged=converged,
+            convergence=Convergence.SEARCH_CUT_OFF.unless(converged),
         )
+        if not are_finite(x, theta):
+            return replace(state, reduced=before), outcome
+        return replace(state, summary=outcome, reduced=reduced), outcome
+
+    def _reduced(self, state: UnscentedState) -> BoundaryBelief:
+        """Return the belief over the patches; before the first frame, of the first particle of each."""
+        if state.reduced is not None:
+            return state.reduced
+        belief = state.summary.belief
+        assert isinstance(belief, BoundaryBelief)
+        mean, covariance = belief.moments()
+        first = jnp.asarray([np.flatnonzero(self.patch == k)[0] for k in range(int(self.patch.max()) + 1)])
+        precision = jnp.diag(1 / jnp.diagonal(covariance)[first])
+        return BoundaryBelief(precision=precision, shift=precision @ mean[first])
 
 
 @eqx.filter_jit
@@ -101,14 +166,17 @@ def update(
     *,
     force_tolerance: Float[Array, ""],
 ) -> tuple[BoundaryBelief, Float[Array, "n 3"], Float[Array, ""], Bool[Array, ""]]:
-    """The reduced belief after one frame, the mean sheet, the squared innovation per dof, and whether all settled."""
+    """Return the reduced belief after one frame, the mean state [m], the NIS, and whether all equilibria were found.
+
+    The NIS is the squared innovation per degree of freedom.
+    """
     mean, covariance = state.moments()
     r = len(mean)
     root, simplex = jnp.linalg.cholesky(covariance), jnp.asarray(simplex_points(r))
 
     def sheet(theta, x):
         b = jnp.maximum(theta, 0)[patch]
-        found = equilibrium(gripped, b, x, force_tolerance=force_tolerance, max_steps=STEPS)
+        found = equilibrium(gripped, b, x, force_tolerance=force_tolerance, max_steps=MAX_NEWTON_STEPS)
         return found.x, found.converged
 
     middle, converged = sheet(mean, start)
@@ -118,23 +186,23 @@ def update(
     slope = slope / (r + 1)
     weighted = jnp.einsum("rni,nij->rnj", slope, evidence.precision)
     residual = jnp.where(evidence.seen[:, None], evidence.y - centre, 0.0)
-    gained, pulled = jnp.einsum("ani,bni->ab", weighted, slope), jnp.einsum("ani,ni->a", weighted, residual)
-    after = state.add(gained, pulled + gained @ mean)
-    explained = pulled @ cho_solve((jnp.linalg.cholesky(after.precision), True), pulled)
-    squared = jnp.einsum("ni,nij,nj->", residual, evidence.precision, residual)
+    precision, score = jnp.einsum("ani,bni->ab", weighted, slope), jnp.einsum("ani,ni->a", weighted, residual)
+    after = state.add(precision, score + precision @ mean)
+    explained = score @ cho_solve((jnp.linalg.cholesky(after.precision), True), score)
+    chi2 = jnp.einsum("ni,nij,nj->", residual, evidence.precision, residual)
     observed = 3 * jnp.maximum(jnp.sum(evidence.seen), 1)
-    nis = (squared - explained) / observed.astype(mean.dtype)
+    nis = (chi2 - explained) / observed.astype(mean.dtype)
     return after, centre, nis, converged & jnp.all(all_converged)
 
 
 def patches(rest: Float[np.ndarray, "n 3"], r: int) -> Int[np.ndarray, " n"]:
-    """The patch of each particle, at most r of them: Lloyd's k-means of the rest positions, from a fixed seed."""
-    label = kmeans2(rest, r, minit="++", rng=np.random.default_rng(0))[1]
+    """Return the patch of each particle, at most r of them, by Lloyd's k-means of the rest positions [m]."""
+    label = kmeans2(rest, r, minit="++", rng=np.random.default_rng(PATCH_SEED))[1]
     return np.unique(label, return_inverse=True)[1]
 
 
 def simplex_points(r: int) -> Float[np.ndarray, "_points r"]:
-    """R + 1 points of zero mean and unit covariance, all equally far from 0."""
+    """Return r + 1 points of zero mean and unit covariance, all equally far from 0."""
     centred = np.eye(r + 1) - 1 / (r + 1)
     basis = np.linalg.qr(centred[:, :r])[0]
     return np.sqrt(r + 1) * centred @ basis

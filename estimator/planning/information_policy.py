@@ -124,7 +124,7 @@ class InformationPolicy(Policy):
         estimator.begin()
         with jax.enable_x64(True), one_thread():
             hold, tool = estimator.hold, estimator.tool
-            predictor = estimator.predictor(self._about)
+            predictor = PullPredictor.from_estimator(estimator, self._about)
             if tool is None or not tool.closed:
                 return self._grasp(estimator, predictor) if self.regrasps else self._leaving or "nothing is grasped"
             if hold is None:

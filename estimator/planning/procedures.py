@@ -112,7 +112,7 @@ class Sew(ProcedurePolicy):
     def act(self, estimator: Estimator) -> Cut | Suture | str:
         """See `ProcedurePolicy.act`."""
         if self.acts:
-            factor = estimator.worked(estimator.changes[-1])
+            factor = estimator.change_log_bayes_factor(estimator.changes[-1])
             if factor is None:
                 return "whether the suture holds could not be seen"
             return "the suture holds" if factor > 0 else "the suture does not hold"
@@ -130,7 +130,7 @@ class Sew(ProcedurePolicy):
 
     def seen(self, estimator: Estimator) -> bool:
         """See `ProcedurePolicy.seen`."""
-        factor = estimator.worked(estimator.changes[-1]) if estimator.changes else None
+        factor = estimator.change_log_bayes_factor(estimator.changes[-1]) if estimator.changes else None
         return factor is not None and abs(factor) >= CERTAIN
 
 

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..belief.attachment_belief import AttachmentBelief, Gaussian
 from ..belief.spike_and_slab import Mixture
+from ..estimator import Estimator
 from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
 from ..physics.block_tridiagonal import lower_inverse
@@ -86,6 +87,21 @@ class PullPredictor(eqx.Module):
             mixture=mixture,
             known=gaussian.variance,
         )
+
+    @classmethod
+    def from_estimator(cls, estimator: Estimator, about: Bool[np.ndarray, " n"] | None = None) -> "PullPredictor":
+        """Return the predictor for an estimator's belief; call `Estimator.release` first once a grasp is over.
+
+        Args:
+            estimator: its filter is 'implicit', and its sheet is known.
+            about: particles whose attachments are asked about; all if None.
+
+        Raises:
+            ValueError: the sheet is not known, or the filter is another.
+        """
+        balance, belief = estimator.balance, estimator.attachment_belief
+        asked = jnp.ones(len(belief.shift), dtype=bool) if about is None else jnp.asarray(about)
+        return cls.build(balance, belief, jnp.asarray(estimator.point_precision), asked)
 
     def scenarios(self, key: PRNGKeyArray, count: int, *, unknown: float | Array) -> Float[Array, "count n"]:
         """Draws of s: free, or on which rung, for each particle by itself, then all s together given that.

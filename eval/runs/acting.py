@@ -96,7 +96,11 @@ def acts(policy: Policy | None, estimator: Estimator) -> Json | None:
     if not isinstance(policy, ProcedurePolicy):
         return None
     seen: list[object] = [
-        {"frame": one.index, "kind": type(one.event).__name__.lower(), "log_bayes_factor": estimator.worked(one)}
+        {
+            "frame": one.index,
+            "kind": type(one.event).__name__.lower(),
+            "log_bayes_factor": estimator.change_log_bayes_factor(one),
+        }
         for one in estimator.changes
     ]
     return {"name": policy.name, "cycles": len(seen), "success": None, "acts": seen}

@@ -125,7 +125,7 @@ def _judged(scene: Scene, reference: Reference, estimator: Estimator, act: Cut |
     nearest = sorted(grasp_points(scene), key=lambda point: float(np.linalg.norm(np.array(point) - middle)))
     lifts = replace(scene, programme=replace(scene.programme, points=tuple(nearest[:LIFTED])))
     _show(reference, estimator, programme(lifts))
-    return estimator.worked(estimator.changes[-1]) or 0.0
+    return estimator.change_log_bayes_factor(estimator.changes[-1]) or 0.0
 
 
 def _show(reference: Reference, estimator: Estimator, actions: Iterator[Action]) -> None:

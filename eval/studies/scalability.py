@@ -11,11 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jiggle_mj.estimator.belief.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.config import EstimatorConfig
 from jiggle_mj.estimator.filters.build import build_filter
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter
 from jiggle_mj.estimator.planning.information_policy import EXPECTED, JUDGED, LIKELY, PULLS
 from jiggle_mj.estimator.planning.outcomes import outcomes
 from jiggle_mj.estimator.planning.pull_predictor import CandidatePull, PullPredictor
@@ -45,10 +43,11 @@ def scalability(sizes: Iterable[int], *, log: Callable[[str], None]) -> Times:
 
 def our_plan(one: Case) -> Callable[[], object]:
     """What `InformationPolicy` asks of a grasp: what pulls teach, and whether the best is safe."""
-    filter, belief = build_filter(one.mesh, one.declaration, EstimatorConfig())
-    assert isinstance(filter, ImplicitFilter) and isinstance(belief, AttachmentBelief)
+    filter = build_filter(one.mesh, one.declaration, EstimatorConfig()).by_forces("predicts pulls")
+    state = filter.init(jax.random.key(0))
+    belief = filter.belief(state)
     everywhere = jnp.ones(len(belief.shift), dtype=bool)
-    predictor = PullPredictor.build(filter.balance, belief, jnp.eye(3) / NOISE**2, everywhere)
+    predictor = PullPredictor.build(filter.balance(state), belief, jnp.eye(3) / NOISE**2, everywhere)
     pull, held = one.frames[-1].pull, one.frames[-1].held
     assert pull is not None
     ends = pull.before[None] + jnp.asarray(PULLS)[:, None]

@@ -1,4 +1,4 @@
-"""A strip whose hold is out of view: the declared mesh reaches beyond what is measured."""
+"""A strip whose attachment is out of view is suspected there: the declared mesh extends beyond the measured points."""
 
 import json
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.filters.implicit import PROBABILITY
+from jiggle_mj.estimator.belief.prior import PriorConfig
 from jiggle_mj.estimator.physics.energy import SheetEnergy
 from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.surrogate import surrogate
@@ -21,11 +21,13 @@ STRIP = jittered(equilateral(16, 5, 4e-3), 0.1)
 FREE = Declaration(gravity=(0.0, 0.0, 0.0), bed=False)
 LEFT, RIGHT = STRIP.rest[:, 0].min(), STRIP.rest[:, 0].max()
 HOLD = LEFT + 9e-3
-"""Attached to the left of this [m]."""
+"""Particles to the left of this are attached [m]."""
 VIEW = LEFT + 18e-3
-"""Measured to the right of this [m]."""
+"""Particles to the right of this are measured [m]."""
 GRIP = RIGHT - 5e-3
+"""Particles to the right of this are held [m]."""
 STEP = 1e-3
+"""Length of a step of the tool [m]."""
 
 TOML = f"""
 name = "strip"
@@ -54,7 +56,7 @@ bed = false
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Five steps of 1 mm, by the estimator's own engine, with 0.05 mm of noise; the left 18 mm are never seen."""
+    """Return a folder of five steps of 1 mm by the estimator's own engine; the left 18 mm are never seen."""
     where = tmp_path_factory.mktemp("strip")
     grip = Grip.build(jnp.asarray(STRIP.rest), jnp.array([RIGHT, 0, 0]), radius=RIGHT - GRIP + 8e-3, stiffness=100.0)
     energy = surrogate(STRIP, FREE)
@@ -73,9 +75,9 @@ def folder(tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_hold_is_suspected_where_nothing_is_seen_and_nowhere_else(folder, tmp_path):
-    """Five frames say that the strip is held beyond the view, not which particles hold it: P(attached) is spread there.
+    """Five frames show that the strip is attached beyond the view, not where: P(attached) is spread there.
 
-    None further right than three particles into the view is reported, and what was seen is suspected less than before.
+    No particle more than three spacings inside the view is reported, and what was seen is suspected less than before.
     """
     summary = import_folder(folder, None, tmp_path / "strip.mcap")
     run_estimator(tmp_path / "strip.mcap", tmp_path / "out")
@@ -84,7 +86,7 @@ def test_the_hold_is_suspected_where_nothing_is_seen_and_nowhere_else(folder, tm
     assert x.min() < LEFT + 2e-3 and summary.n_held > 0
     assert not np.isfinite(found.estimates[-1].observed[x < VIEW - 1e-3]).any()
     seen = (x > VIEW + 3 * 4e-3) & ~found.estimates[-1].held
-    assert not found.detection.attached[seen].any() and probability[seen].mean() < PROBABILITY
+    assert not found.detection.attached[seen].any() and probability[seen].mean() < PriorConfig().probability
     assert probability[x < VIEW].mean() > 4 * probability[seen].mean()
     assert probability[x < VIEW].sum() > 2.5
     assert summary.truth is not None and summary.n_attached

@@ -1,4 +1,4 @@
-"""Weight and bending relative to the membrane, found with the attachments unknown; and refused where nothing tells."""
+"""Weight and bending relative to the membrane are identified with unknown attachments, and refused without evidence."""
 
 from dataclasses import replace
 
@@ -7,25 +7,24 @@ import numpy as np
 import pytest
 
 from jiggle_mj.estimator import Estimator
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter
-from jiggle_mj.estimator.identification import identify
+from jiggle_mj.estimator.identification import Identification, identify
 from jiggle_mj.estimator.physics.ratios import ratios, scaled
 from jiggle_mj.estimator.physics.surrogate import surrogate
 from jiggle_mj.material import DOUBTFUL, material
-from tests.support.small_sheet import DECLARATION, attached, follow, lifts, observed, sheet, sheet_balance, sheet_energy
+from tests.support.small_sheet import DECLARATION, attached, follow, lifts, observed, sheet, sheet_energy, sheet_filter
 
 WEIGHT, BENDING = 0.6, 1.7
-"""What is declared, times the truth."""
+"""Declared weight and bending, as factors on the truth [1]."""
 SEEDS = range(2)
 
 
 def declared() -> np.ndarray:
-    """Log factors of the truth on what is declared."""
+    """Return the log factors of the truth on the declaration [nat]."""
     return -np.log([WEIGHT, BENDING])
 
 
 def test_scaling_is_building_from_another_declaration():
-    """Forces of both, at a state with every term at work."""
+    """The forces of both agree, at a state in which every term acts."""
     other = replace(DECLARATION, areal_density=WEIGHT, thickness=DECLARATION.thickness * BENDING**0.5)
     x = jnp.asarray(lifts()[2].x)
     found = scaled(sheet_energy(), jnp.log(jnp.array([WEIGHT, BENDING]))).internal_gradient(x)
@@ -39,26 +38,30 @@ def test_a_sheet_without_gravity_has_no_weight():
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[tuple]:
-    """Four lifts of a sheet that is declared too light and too stiff to bend."""
+def runs() -> list[Identification]:
+    """Identify a sheet that is declared too light and too stiff to bend, from four lifts."""
     wrong = scaled(sheet_energy(), jnp.log(jnp.array([WEIGHT, BENDING])))
     found = []
     for seed in SEEDS:
-        filter = ImplicitFilter(sheet_balance(1e-4).of(wrong))
+        filter = sheet_filter(1e-4)
+        filter = replace(filter, declared_balance=filter.declared_balance.with_energy(wrong))
         seen = [observed(frame, 100 * seed + i) for i, frame in enumerate(lifts())]
-        _, summary = follow(filter, lifts(), seen)
-        found.append(identify(filter, summary.belief, summary.b, on_pass=lambda _: None))
+        state, *_ = follow(filter, lifts(), seen)
+        found.append(identify(filter, state, on_pass=lambda _: None))
     return found
 
 
 @pytest.mark.slow
 def test_the_truth_is_found_within_its_standard_errors(runs):
-    """Also in the mean over the seeds, where a bias would show."""
+    """Also in the mean over the seeds, where a bias would show: 3.5 and 3 standard errors are the bars."""
     scores = np.array(
         [
-            [(np.log(factors[name]) - true) / log_sd[name] for name, true in zip(factors, declared(), strict=True)]
-            for factors, log_sd, _, converged in runs
-            if converged
+            [
+                (np.log(run.factors[name]) - true) / run.log_sd[name]
+                for name, true in zip(run.factors, declared(), strict=True)
+            ]
+            for run in runs
+            if run.converged
         ]
     )
     assert len(scores) == len(SEEDS)
@@ -67,29 +70,29 @@ def test_the_truth_is_found_within_its_standard_errors(runs):
 
 
 @pytest.mark.slow
-def test_standard_errors_say_something(runs):
-    assert all(log_sd["weight"] < 0.1 and log_sd["bending"] < DOUBTFUL for _, log_sd, _, _ in runs)
+def test_standard_errors_are_small(runs):
+    assert all(run.log_sd["weight"] < 0.1 and run.log_sd["bending"] < DOUBTFUL for run in runs)
 
 
 @pytest.mark.slow
 def test_the_attachments_are_found_with_the_right_sheet(runs):
-    for _, _, summary, _ in runs:
-        found = np.asarray(summary.probability) > 0.5
+    for run in runs:
+        found = np.asarray(run.summary.probability) > 0.5
         assert (found == attached()).mean() > 0.95
 
 
 @pytest.mark.slow
-def test_frames_at_rest_say_nothing():
-    """The first of each lift, where nothing has moved yet."""
-    filter, frames = ImplicitFilter(sheet_balance(1e-4)), lifts()[::4]
-    _, summary = follow(filter, frames, [observed(frame, i) for i, frame in enumerate(frames)])
-    factors, log_sd, _, converged = identify(filter, summary.belief, summary.b, on_pass=lambda _: None)
-    found = material(DECLARATION, factors, log_sd, converged=converged)
+def test_frames_at_rest_hold_no_evidence():
+    """Nothing has moved yet in the first frame of each lift."""
+    filter, frames = sheet_filter(1e-4), lifts()[::4]
+    state, *_ = follow(filter, frames, [observed(frame, i) for i, frame in enumerate(frames)])
+    run = identify(filter, state, on_pass=lambda _: None)
+    found = material(DECLARATION, run.factors, run.log_sd, converged=run.converged)
     assert set(found.refused) == {"weight", "bending", "membrane stiffness"}
     assert found.declaration == DECLARATION
 
 
-def test_what_is_found_becomes_a_declaration():
+def test_the_identified_sheet_becomes_a_declaration():
     found = material(DECLARATION, {"weight": 0.5, "bending": 4.0}, {"weight": 0.02, "bending": 0.1}, converged=True)
     assert set(found.refused) == {"membrane stiffness"}
     assert found.declaration.membrane_stiffness == pytest.approx(2 * DECLARATION.membrane_stiffness)

@@ -14,7 +14,7 @@ import pytest
 
 from jiggle_mj import cli
 from jiggle_mj.errors import SceneError
-from jiggle_mj.estimator.belief.summaries import RULE
+from jiggle_mj.estimator.summaries import RULE
 from jiggle_mj.scenes import DISTURBANCES, load_scene, shipped_scenes
 from jiggle_mj.scenes.scene.attachments import SHAPES, Attachment
 from jiggle_mj.scenes.scene.scene import Scene

@@ -1,18 +1,22 @@
-"""A small sheet that several tests share, so that JAX compiles its shapes once, and lifts of it by our own engine."""
+"""A small sheet that several tests share, so that JAX compiles its shapes once, and its lifts by our own engine."""
 
 from dataclasses import dataclass
 from functools import cache
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jiggle_mj.estimate import Belief
 from jiggle_mj.estimator.belief.attachment_belief import AttachmentBelief
+from jiggle_mj.estimator.belief.prior import prior_belief
 from jiggle_mj.estimator.effects.sheet_model import FrameContext, SheetModel, centred, nominal_energy
-from jiggle_mj.estimator.filters.evidence import Evidence, PosteriorSummary, Update
-from jiggle_mj.estimator.filters.force_balance import LEAST, ForceBalance
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter, prior_belief
+from jiggle_mj.estimator.filters.config import FilterConfig
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
+from jiggle_mj.estimator.filters.implicit import ImplicitFilter, ImplicitState
+from jiggle_mj.estimator.filters.posterior_summary import PosteriorSummary, Update
 from jiggle_mj.estimator.physics.block_tridiagonal import BlockTridiagonal, Layout
 from jiggle_mj.estimator.physics.energy import SheetEnergy
 from jiggle_mj.estimator.physics.environment import Grip
@@ -26,34 +30,37 @@ from jiggle_mj.observation import Declaration
 SPACING = 7e-3
 DECLARATION = Declaration()
 STIFFNESS = 3.0
-"""Of each attached particle [N/m], a tenth of the membrane's."""
+"""Stiffness of each attached particle [N/m], a tenth of the membrane's."""
 GRIP_RADIUS = 8e-3
 STOOD = (np.zeros(1), np.zeros((1, 3)))
-"""When the tool reported [s], and how far it had gone [m]."""
+"""Time of the tool's report [s], and its displacement [m]."""
 FORCE_TOLERANCE = 1e-8
-"""[N]; the weight of one particle is 4e-4."""
+"""Residual force of an equilibrium [N]; the weight of one particle is 4e-4."""
 
 WELD = 1e6
-"""[N/m]."""
+"""Stiffness that stands for a weld [N/m]."""
 NOISE, GRIP_SD = 1e-4, 1.5e-3
-"""Standard deviations of what is seen of a particle, and of a held one [m]."""
+"""Standard deviations of the position of a seen particle, and of a held one [m]."""
+
+OUTWARD = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+"""Directions of the four corners."""
 
 search = eqx.filter_jit(equilibrium)
 
 
 def equilateral(columns: int, rows: int, spacing: float = SPACING) -> SheetMesh:
-    """The benchmark's, at this file's spacing."""
+    """Return the benchmark's mesh of equilateral triangles, at this file's spacing [m]."""
     return benchmark.equilateral(columns, rows, spacing)
 
 
 def jittered(mesh: SheetMesh, share: float, seed: int = 0) -> SheetMesh:
-    """The same triangles with every particle moved in the plane by up to `share` of the spacing."""
+    """Return the same triangles with every particle moved in the plane by up to `share` of the spacing."""
     move = np.random.default_rng(seed).uniform(-share, share, (mesh.n, 2)) * mesh.spacing
     return SheetMesh(mesh.rest + np.column_stack([move, np.zeros(mesh.n)]), mesh.faces)
 
 
 def dense(layout: Layout, matrix: BlockTridiagonal) -> np.ndarray:
-    """The 3n x 3n matrix in particle order."""
+    """Return the 3n x 3n matrix in particle order."""
     nb, m = matrix.diagonal.shape[:2]
     whole = np.zeros((nb * m, nb * m))
     for k in range(nb):
@@ -77,25 +84,28 @@ class Lift:
 
 @cache
 def sheet() -> SheetMesh:
-    """81 particles, 60 mm x 48 mm, slightly irregular."""
+    """Return 81 particles, 60 mm x 48 mm, slightly irregular."""
     return jittered(equilateral(9, 9), 0.1)
 
 
 @cache
 def sheet_energy() -> SheetEnergy:
-    """Membrane, bending, weight and bed."""
+    """Return the energy of membrane, bending, weight and bed."""
     return surrogate(sheet(), DECLARATION)
 
 
 @cache
 def sheet_balance(force_sd: float, force_level: float = np.inf) -> ForceBalance:
-    """What the implicit filter linearises; both [N]. Of data of its own model on its own mesh no share is wrong."""
+    """Return the balance of forces that the implicit filter linearises, for forces in N.
+
+    For data of its own model on its own mesh, no share of the forces is wrong: `force_level` is infinite.
+    """
     k = DECLARATION.membrane_stiffness
     return ForceBalance.build(
         sheet(),
         sheet_energy(),
         reference=k,
-        force_sd=force_sd / LEAST,
+        force_sd=force_sd / FilterConfig().force_sd_floor,
         force_level=force_level,
         anchor_sd=1e-4,
         grip_stiffness=3 * k,
@@ -104,7 +114,7 @@ def sheet_balance(force_sd: float, force_level: float = np.inf) -> ForceBalance:
 
 @cache
 def sheet_prior() -> AttachmentBelief:
-    """The implicit filter's."""
+    """Return the implicit filter's prior."""
     return prior_belief(sheet(), reference=DECLARATION.membrane_stiffness)
 
 
@@ -116,7 +126,7 @@ def at_rest(
     times: np.ndarray = STOOD[0],
     ways: np.ndarray = STOOD[1],
 ) -> tuple[SheetModel, FrameContext]:
-    """A sheet's model without effects, and a moment when it lies as ever, whatever the tool says."""
+    """Return a sheet's model without effects, and a moment at which it lies at rest whatever the tool reports."""
     x = jnp.asarray(mesh.rest)
     model = SheetModel(
         energy=nominal_energy(mesh, declared), tool=jnp.zeros(3), view=centred(mesh), time=jnp.asarray(at)
@@ -140,26 +150,26 @@ def at_rest(
 
 
 def gripped(energy: SheetEnergy, x: np.ndarray, corner: np.ndarray, tip: np.ndarray) -> SheetEnergy:
-    """The energy with jaws that closed at a corner around particles at x, the tip moved since."""
+    """Return the energy with jaws that closed at a corner around particles at x [m], and moved to `tip` since [m]."""
     grip = Grip.build(jnp.asarray(x), jnp.asarray(corner), radius=GRIP_RADIUS, stiffness=100.0)
     grip = eqx.tree_at(lambda g: g.tip, grip, jnp.asarray(tip))
     return SheetEnergy.build(np.asarray(energy.rest), (*energy.terms, grip), energy.layout)
 
 
 def attached() -> np.ndarray:
-    """A disc in the middle."""
+    """Return which particles are attached: a disc in the middle."""
     return np.linalg.norm(sheet().rest, axis=1) < 11e-3
 
 
 def corners() -> list[np.ndarray]:
-    """Where the jaws close [m]."""
+    """Return where the jaws close [m]."""
     flat = sheet().rest[:, :2]
-    return [sheet().rest[np.argmax(flat @ np.array(way))] + 1e-3 for way in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return [sheet().rest[np.argmax(flat @ np.array(outward))] + 1e-3 for outward in OUTWARD]
 
 
 @cache
 def lifts(stiffness: float = STIFFNESS) -> tuple[Lift, ...]:
-    """Three frames of each of four corner lifts, the attached particles on springs of the given stiffness.
+    """Return a closing and three lifted frames at each of four corners, with attachments of the given stiffness [N/m].
 
     Infinity is a weld: a spring so stiff that nothing moves by a micrometre.
     """
@@ -177,24 +187,32 @@ def lifts(stiffness: float = STIFFNESS) -> tuple[Lift, ...]:
     return tuple(frames)
 
 
-def follow(filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence]) -> tuple[Update, PosteriorSummary]:
-    """All frames, the jaws opening after each lift; the last update, and what is stated at the end."""
-    belief, b, grasp, update = sheet_prior(), jnp.zeros(sheet().n), 1, None
-    for frame, one in zip(frames, seen, strict=True):
+def sheet_filter(force_sd: float, *, learns_noise: bool = True) -> ImplicitFilter:
+    """Return the implicit filter for this sheet; the force error holds everywhere [N]."""
+    return ImplicitFilter(declared_balance=sheet_balance(force_sd), prior=sheet_prior(), learns_noise=learns_noise)
+
+
+def follow(
+    filter: ImplicitFilter, frames: tuple[Lift, ...], seen: list[Evidence]
+) -> tuple[ImplicitState, Update, PosteriorSummary]:
+    """Take all frames, with the jaws opening after each lift; return state, last update and posterior."""
+    state, grasp, update = filter.init(jax.random.key(0)), 1, None
+    for frame, evidence in zip(frames, seen, strict=True):
         if frame.grasp != grasp:
-            summary = filter.release(belief)
+            state, summary = filter.release(state)
             assert summary is not None
-            belief, b, grasp = summary.belief, summary.b, frame.grasp
-        update = filter.update(belief, b, one, one.y)
-        belief, b = update.belief, update.b
-    summary = filter.release(belief)
+            grasp = frame.grasp
+        state, update = filter.update(state, evidence, evidence.y)
+    state, summary = filter.release(state)
     assert update is not None and summary is not None
-    return update, summary
+    return state, update, summary
 
 
 def nees(belief: AttachmentBelief) -> float:
-    """Squared error of the attached particles' s in units of their stated covariance, per degree of freedom, where
-    attached means `STIFFNESS`; free ones are exactly where the prior has its peak, and would be none."""
+    """Return the NEES per degree of freedom of the attached particles' s, where the truth is `STIFFNESS`.
+
+    Free particles are left out: their truth lies exactly at the peak of the prior.
+    """
     mean, covariance = (np.asarray(part) for part in belief.moments())
     summary = Belief(mean=mean, covariance=covariance, reference=float(belief.reference))
     found = nees_per_dof(summary, STIFFNESS * attached(), among=attached())
@@ -203,7 +221,7 @@ def nees(belief: AttachmentBelief) -> float:
 
 
 def cloud(x: np.ndarray, seed: int, sd: float) -> np.ndarray:
-    """1500 points anywhere on the sheet at x, with noise, in no order."""
+    """Return 1500 points anywhere on the sheet at x [m], with noise of standard deviation `sd` [m], in no order."""
     rng = np.random.default_rng(seed)
     corner = sheet().faces[rng.integers(len(sheet().faces), size=1500)]
     weights = rng.dirichlet(np.ones(3), len(corner))
@@ -211,7 +229,7 @@ def cloud(x: np.ndarray, seed: int, sd: float) -> np.ndarray:
 
 
 def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:
-    """Noisy positions, and held particles as the tip says."""
+    """Return the evidence of noisy positions; held particles have the grip's precision."""
     noisy = frame.x + NOISE * np.random.default_rng(seed).normal(size=frame.x.shape)
     sd = np.where(frame.held, GRIP_SD, NOISE)
     precision = np.eye(3) / sd[:, None, None] ** 2

@@ -13,9 +13,8 @@ from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.belief.attachment_belief import SITE_PRECISION, AttachmentBelief
 from jiggle_mj.estimator.belief.attachment_prior import AttachmentPrior
-from jiggle_mj.estimator.belief.spike_and_slab import SpikeAndSlab
+from jiggle_mj.estimator.belief.prior import PriorConfig, stiffness_prior
 from jiggle_mj.estimator.belief.topology import FAILS, Change, after, region_of
-from jiggle_mj.estimator.filters.implicit import COMPONENTS, DIRICHLET_STRENGTH, PARTIAL, SPIKE, SPREAD
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, ToolState
 
 N, REFERENCE = 12, 30.0
@@ -26,9 +25,7 @@ CUT = Cut(path=np.zeros((1, 2)), width=1e-2)
 @pytest.fixture(scope="module")
 def belief() -> AttachmentBelief:
     """A chain, half of it attached with s = 0.03, seen with correlated noise of 0.004."""
-    stiffness = SpikeAndSlab.build(
-        spike=SPIKE, components=COMPONENTS, spread=SPREAD, dirichlet_strength=DIRICHLET_STRENGTH, partial=PARTIAL
-    )
+    stiffness = stiffness_prior(PriorConfig())
     edges = np.stack([np.arange(N - 1), np.arange(1, N)], axis=1)
     prior = AttachmentPrior.build(N, edges, stiffness=stiffness, probability=0.05, coupling=1.0)
     true = jnp.where(jnp.arange(N) < 6, 0.03, 0.0)
@@ -149,7 +146,7 @@ def test_an_event_while_the_jaws_are_open_is_taken():
     estimator.update(look())
     estimator.update(look((Suture(path=np.array([[0.02, 0.02]]), width=0.025, stiffness=1.0),)))
     (change,) = estimator.changes
-    assert change.region.sum() == 5 and estimator.worked(change) is None
+    assert change.region.sum() == 5 and estimator.change_log_bayes_factor(change) is None
     assert (estimator.detection.attached == change.region).all()
 
 

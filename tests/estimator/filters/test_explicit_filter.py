@@ -1,4 +1,4 @@
-"""The paper's filter: the textbook's formulas, missing particles, what it finds on its own simulator."""
+"""The paper's filter agrees with the textbook's formulas, ignores missing particles, and works on its own simulator."""
 
 import equinox as eqx
 import jax
@@ -23,16 +23,16 @@ ATTACHED = np.linalg.norm(MESH.rest, axis=1) < 9e-3
 
 
 def updated(belief: BoundaryBelief, shots: Shots, b: jax.Array | None = None) -> BoundaryBelief:
-    """Linearised at b, by default at the mean where that is not negative."""
+    """Return the belief after an update linearised at b, by default at the mean where that is not negative."""
     return update(SIMULATOR, belief, jnp.maximum(belief.mean(), 0) if b is None else b, shots, sweeps=SWEEPS)[0]
 
 
 def shots(truth: np.ndarray, seed: int) -> list[Shots]:
-    """Six steps of 4 mm of each of four corner lifts by f itself, one sample each, with noise on what is observed."""
+    """Return six steps of 4 mm of each of four corner lifts, simulated by f, with noise on what is observed."""
     rng, samples = np.random.default_rng(seed), []
     step = jax.jit(lambda x, grip: SIMULATOR.step(x, jnp.asarray(truth), grip, sweeps=SWEEPS))
-    for way in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-        corner = MESH.rest[np.argmax(MESH.rest[:, :2] @ np.array(way))] + 1e-3
+    for outward in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+        corner = MESH.rest[np.argmax(MESH.rest[:, :2] @ np.array(outward))] + 1e-3
         grip = Grip.build(jnp.asarray(MESH.rest), jnp.asarray(corner), radius=GRIP_RADIUS, stiffness=100.0)
         x = seen = MESH.rest
         for height in 4e-3 * np.arange(1, 7):
@@ -65,7 +65,7 @@ def lift() -> list[Shots]:
 
 
 def test_an_update_is_the_papers_equations(lift):
-    """Three stacked samples against K = Sigma J^T (J Sigma J^T + V)^-1 in covariance form, J by finite differences."""
+    """Three stacked samples agree with K = Sigma J^T (J Sigma J^T + V)^-1, J by finite differences."""
     belief = BoundaryBelief.prior(MESH.n, mean=0.5, sd=1.0)
     three = stacked([lift[1], lift[8], lift[5]])
     after, _, nis = update(SIMULATOR, belief, belief.mean(), three, sweeps=SWEEPS)
@@ -99,7 +99,7 @@ def test_a_missing_particle_has_no_influence(lift):
 
 
 def filtered(samples: list[Shots]) -> tuple[BoundaryBelief, np.ndarray]:
-    """One sample a frame, from the paper's prior mean, each linearised at the constrained mean."""
+    """Return belief and constrained mean after one sample in each frame, from the paper's prior mean."""
     belief, b = BoundaryBelief.prior(MESH.n, mean=1e-4, sd=3.0), jnp.zeros(MESH.n)
     for sample in samples:
         belief = updated(belief, sample, b)
@@ -108,13 +108,13 @@ def filtered(samples: list[Shots]) -> tuple[BoundaryBelief, np.ndarray]:
 
 
 def test_attached_particles_rank_above_all_others_on_its_own_simulator(lift):
-    """Shrunk by the prior and by noise in x_m that f ignores, so a threshold at half the truth would miss some."""
+    """Prior and noise in x_m, which f ignores, shrink the estimates: half the truth would be too high a bar."""
     mean = filtered(lift)[1]
     assert mean[ATTACHED].min() > 2 * mean[~ATTACHED].max()
 
 
 def test_what_is_seen_is_evidence_for_the_b_that_was_simulated(lift):
-    """A sheet that moves as f(b = 0) says b = 0, with no shift, also to a belief whose mean is below 0."""
+    """A sheet that moves as f(b = 0) is evidence for b = 0, without a shift, also where the mean is below 0."""
     belief, nothing = BoundaryBelief.prior(MESH.n, mean=-0.5, sd=1.0), jnp.zeros(MESH.n)
     agreeing = eqx.tree_at(lambda shot: shot.end, lift[3], predicted_stack(lift[3], nothing))
     after = updated(belief, agreeing, nothing)
@@ -128,17 +128,19 @@ def test_the_latest_sample_is_always_drawn_and_none_from_before_the_cut():
     assert set(np.concatenate(drawn).tolist()) == {0, 1, 2, 3, 4, 5}
     assert draw_samples(0, 3, np.random.default_rng(0)).tolist() == [0]
 
-    history = ShotHistory(grip_stiffness=90.0, samples=3)
+    history = ShotHistory.empty(jax.random.key(0))
     for height in (1.0, 2.0, 3.0):
-        history.add(step(height))
-    history.forget()
-    after = [history.add(step(height)) for height in (4.0, 5.0)]
+        history, _ = history.with_step(step(height), grip_stiffness=90.0).draw(3)
+    history, after = history.forgotten(), []
+    for height in (4.0, 5.0):
+        history, drawn = history.with_step(step(height), grip_stiffness=90.0).draw(3)
+        after.append(drawn)
     heights = [np.asarray(one.tip)[np.asarray(one.precision).any(axis=(1, 2, 3)), 2].tolist() for one in after]
     assert heights == [[4.0], [4.0, 5.0]]
 
 
 def step(height: float) -> Evidence:
-    """A frame that is told by the height of the tip."""
+    """Return a frame that the height of its tip identifies [m]."""
     one, x = np.ones(MESH.n, bool), jnp.asarray(MESH.rest)
     pull = Pull(before=x, tip=jnp.asarray([0.0, 0.0, height]), length=jnp.ones(MESH.n))
     precision = jnp.broadcast_to(jnp.eye(3), (MESH.n, 3, 3))

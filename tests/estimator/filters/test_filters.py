@@ -1,48 +1,63 @@
-"""What every filter keeps: it sharpens if it states an uncertainty, repeats itself to the byte, takes no notice of what
-was not seen, and forgets a frame that no state explains."""
+"""What holds for every filter: updates sharpen the belief, repeat to the byte, ignore what was not seen, and leave out
+a frame that no state explains."""
 
+import copy
 from functools import cache
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.belief.attachment_belief import AttachmentBelief
 from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
-from jiggle_mj.estimator.filters.adam import AdamShooting
-from jiggle_mj.estimator.filters.evidence import Evidence, Filter, Pull
+from jiggle_mj.estimator.filters.adam import RATE, AdamShooting
+from jiggle_mj.estimator.filters.evidence import Evidence, Pull
 from jiggle_mj.estimator.filters.explicit import MultipleShooting
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.estimator.filters.filter import Filter, FilterState
 from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
+from jiggle_mj.estimator.filters.posterior_summary import Update
+from jiggle_mj.estimator.filters.shots import simulator
 from jiggle_mj.estimator.filters.unscented import ReducedUnscented
-from tests.support.small_sheet import DECLARATION, corners, lifts, sheet, sheet_balance, sheet_energy, sheet_prior
+from jiggle_mj.estimator.physics.xpbd import XPBD
+from tests.support.small_sheet import DECLARATION, corners, lifts, sheet, sheet_energy, sheet_filter
 
 NOISE = 2e-4
 K = DECLARATION.membrane_stiffness
 N = sheet().n
+KEY = jax.random.key(0)
+
+
+def gaussian(*, mean: float = 1e-4) -> dict[str, Any]:
+    """Return the prior of the filters over stiffnesses, with a standard deviation of 1 N/m."""
+    return {"prior": BoundaryBelief.prior(N, mean=mean, sd=1.0), "prior_sd": 1.0}
 
 
 def implicit() -> Filter:
-    return ImplicitFilter(sheet_balance(6e-4))
+    return sheet_filter(6e-4)
 
 
 def explicit() -> Filter:
-    return MultipleShooting(sheet(), DECLARATION, grip_stiffness=3 * K, samples=2)
+    return MultipleShooting(**gaussian(), simulator=shooting(), grip_stiffness=3 * K, samples=2)
 
 
 def adam() -> Filter:
-    return AdamShooting(sheet(), DECLARATION, grip_stiffness=3 * K, samples=2)
+    return AdamShooting(**gaussian(), simulator=shooting(), grip_stiffness=3 * K, samples=2, rate=RATE * K)
+
+
+@cache
+def shooting() -> XPBD:
+    return simulator(sheet(), DECLARATION)
 
 
 @cache
 def nnls() -> Filter:
-    """Keeps nothing, so one will do."""
-    return NonNegativeLeastSquares.build(sheet_energy(), force_sd=6e-4)
+    return NonNegativeLeastSquares.build(sheet_energy(), **gaussian(), force_sd=6e-4)
 
 
 def unscented() -> Filter:
-    return ReducedUnscented(sheet(), sheet_energy(), grip_stiffness=3 * K, force_tolerance=1.5e-4)
+    return ReducedUnscented.build(sheet(), sheet_energy(), **gaussian(), grip_stiffness=3 * K, force_tolerance=1.5e-4)
 
 
 FILTERS = (implicit, explicit, adam, nnls, unscented)
@@ -50,7 +65,7 @@ MOSTLY_QUICK = (implicit, explicit, nnls, *(pytest.param(one, marks=pytest.mark.
 
 
 def frame(number: int, hidden: np.ndarray | None = None, lie: float = 0.0) -> Evidence:
-    """Frame `number` of the first lift; what is hidden has no precision, and `lie` [m] is added to it."""
+    """Return frame `number` of the first lift; hidden particles have no precision, and `lie` [m] is added to them."""
     now, before = lifts()[number], lifts()[number - 1]
     y = now.x + NOISE * np.random.default_rng(number).normal(size=now.x.shape)
     precision = np.broadcast_to(np.eye(3) / NOISE**2, (N, 3, 3)).copy()
@@ -63,24 +78,22 @@ def frame(number: int, hidden: np.ndarray | None = None, lie: float = 0.0) -> Ev
     return Evidence(y=jnp.asarray(y), precision=jnp.asarray(precision), held=held, force_unknown=held, pull=pull)
 
 
-def prior(filter: Filter) -> BoundaryBelief | AttachmentBelief:
-    return sheet_prior() if isinstance(filter, ImplicitFilter) else BoundaryBelief.prior(N, mean=1e-4, sd=1.0)
-
-
-def run(filter: Filter, frames: list[Evidence]):
-    belief, b, outcomes = prior(filter), jnp.zeros(N), []
+def run(filter: Filter, frames: list[Evidence]) -> tuple[FilterState, list[Update]]:
+    """Return the state after all frames, and the update of each."""
+    state, outcomes = filter.init(KEY), []
     for one in frames:
-        out = filter.update(belief, b, one, jnp.where(one.precision[:, :1, 0] > 0, one.y, jnp.asarray(sheet().rest)))
-        belief, b = out.belief, out.b
+        start = jnp.where(one.precision[:, :1, 0] > 0, one.y, jnp.asarray(sheet().rest))
+        state, out = filter.update(state, one, start)
         outcomes.append(out)
-    return outcomes
+    return state, outcomes
 
 
 @pytest.mark.parametrize("make", MOSTLY_QUICK)
 def test_every_filter_sharpens_stays_non_negative_and_repeats_itself(make):
+    """Adam gives no uncertainty; the others lower the entropy with every frame."""
     frames = [frame(number) for number in (1, 2, 3)]
-    first, second = run(make(), frames), run(make(), frames)
-    entropies = [float(prior(make()).entropy()), *(float(out.entropy) for out in first)]
+    first, second = run(make(), frames)[1], run(make(), frames)[1]
+    entropies = [float(make().init(KEY).summary.entropy), *(float(out.entropy) for out in first)]
     if make is adam:
         for out in first:
             summary = (out.sd, out.entropy, out.nis, *out.belief.moments())
@@ -101,23 +114,43 @@ def test_every_filter_sharpens_stays_non_negative_and_repeats_itself(make):
 def test_what_was_not_seen_does_not_matter(make):
     hidden = np.zeros(N, bool)
     hidden[[3, 20, 44, 60]] = True
-    one, other = (run(make(), [frame(1), frame(2, hidden, lie)])[-1] for lie in (0.0, 0.3))
+    one, other = (run(make(), [frame(1), frame(2, hidden, lie)])[1][-1] for lie in (0.0, 0.3))
     np.testing.assert_allclose(other.belief.precision, one.belief.precision, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(other.b, one.b, atol=1e-9)
 
 
 @pytest.mark.parametrize("make", FILTERS)
-def test_a_frame_without_a_state_is_said_to_be_so_and_forgotten(make):
-    """The caller refuses it; later frames, and the opening of the jaws, go on as if it had not been."""
+def test_a_frame_without_a_state_is_refused_and_left_out(make):
+    """Later frames, and the opening of the jaws, go on as if it had not been there."""
     filter, good, bad = make(), [frame(1), frame(2)], frame(3)
     bad = eqx.tree_at(lambda one: one.y, bad, bad.y * jnp.nan)
-    first = run(filter, good[:1])[-1]
-    refused = filter.update(first.belief, first.b, bad, bad.y)
-    assert not (np.isfinite(refused.x).all() and np.isfinite(refused.b).all())
-    after, as_if = filter.update(first.belief, first.b, good[1], good[1].y), run(make(), good)[-1]
+    first, _ = run(filter, good[:1])
+    without, refused = filter.update(first, bad, bad.y)
+    assert not refused.explains_the_frame
+    assert without.summary is first.summary
+    state, after = filter.update(without, good[1], good[1].y)
+    as_if = run(make(), good)[1][-1]
     np.testing.assert_array_equal(after.b, as_if.b)
-    if (refined := filter.release(after.belief)) is not None:
-        assert np.isfinite(refined.b).all()
+    _, refined = filter.release(state)
+    assert refined is None or refined.is_finite
+
+
+@pytest.mark.parametrize("make", MOSTLY_QUICK)
+def test_a_state_is_a_pytree_and_a_copy_of_it_goes_on_as_the_state_does(make):
+    """Byte by byte; and an update leaves the state that it was given as it was."""
+    filter = make()
+    state, _ = run(filter, [frame(1), frame(2)])
+    copied, leaves = copy.deepcopy(state), len(jax.tree.leaves(state))
+    outs = [filter.update(one, frame(3), frame(3).y)[1] for one in (state, copied, state)]
+    assert len({np.asarray(out.b).tobytes() for out in outs}) == 1
+    assert len(jax.tree.leaves(state)) == len(jax.tree.leaves(copied)) == leaves
+
+
+@pytest.mark.parametrize("make", [explicit, nnls])
+def test_only_the_implicit_filter_predicts_pulls(make):
+    with pytest.raises(ValueError, match=f"only the filter 'implicit' predicts pulls; this one is '{make.__name__}'"):
+        make().by_forces("predicts pulls")
+    assert implicit().by_forces("predicts pulls").name == "implicit"
 
 
 @pytest.mark.parametrize("make", [explicit, adam, unscented])

@@ -1,19 +1,22 @@
-"""What a frame says of the attachments: the dense formula, from free to welded, and particles that were not seen."""
+"""A frame's evidence about the attachments agrees with the dense formula, from free to welded."""
+
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.filters import force_balance
+from jiggle_mj.estimator.filters.config import FilterConfig
 from jiggle_mj.estimator.filters.evidence import Evidence
-from jiggle_mj.estimator.filters.force_balance import DOUBT, FAINT, LEAST, ForceBalance
+from jiggle_mj.estimator.filters.force_balance import ForceBalance
 from tests.support.small_sheet import DECLARATION, attached, dense, lifts, sheet, sheet_balance, sheet_energy
 from tests.support.small_sheet import observed as evidence
 
 K = DECLARATION.membrane_stiffness
 FORCE_SD, FORCE_LEVEL, ANCHOR_SD = 1e-4, 24e-3, 1e-4
 N = sheet().n
+CONFIG = FilterConfig()
 
 
 @eqx.filter_jit
@@ -28,10 +31,10 @@ def balance() -> ForceBalance:
 
 
 def test_information_equals_the_dense_formula(balance):
-    """D^T N^-1 D, -D^T N^-1 e and e^T N^-1 e over particles that are not held, with N = V + H R H^T written out.
+    """Precision, score and chi2 are D^T N^-1 D, -D^T N^-1 e and e^T N^-1 e over free particles, with N = V + H R H^T.
 
-    tau grows, from FORCE_SD, with the sum of what the elements around a particle pull at it. D is shrunk by a multiple
-    of the share that the covariance of x given all that was seen makes up.
+    tau grows, from FORCE_SD, with the sum of the forces of the elements around a particle. D is shrunk by a multiple of
+    the share that its error makes up, by the covariance of x given all that was seen.
     """
     frame = lifts()[3]
     seen, x = evidence(frame, 1), frame.x
@@ -47,38 +50,40 @@ def test_information_equals_the_dense_formula(balance):
     R = np.zeros((3 * N, 3 * N))
     D = np.zeros((3 * N, N))
     for i in range(N):
-        R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = np.linalg.inv(np.asarray(seen.precision)[i] + FAINT * np.eye(3))
+        R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = np.linalg.inv(
+            np.asarray(seen.precision)[i] + CONFIG.position_precision_floor * np.eye(3)
+        )
         D[3 * i : 3 * i + 3, i] = K * d[i] - internal[i]
     flow = np.zeros(N)
     for term in sheet_energy().terms:
         forces = np.asarray(eqx.filter_jit(term.gradient)(jnp.asarray(x[np.asarray(term.vertices)])))
         np.add.at(flow, np.asarray(term.vertices), np.linalg.norm(forces, axis=2))
-    tau = np.sqrt(FORCE_SD**2 + (FORCE_SD / LEAST * flow / FORCE_LEVEL) ** 2)
+    tau = np.sqrt(FORCE_SD**2 + (FORCE_SD / CONFIG.force_sd_floor * flow / FORCE_LEVEL) ** 2)
     assert tau.max() > 1.3 * tau.min()
     V = np.diag(((1 - each) * np.repeat(tau, 3)) ** 2 + (each * K * ANCHOR_SD) ** 2)
     W = np.where(free, 1 / np.diagonal(V), 0)
     covariance = np.linalg.inv(np.linalg.inv(R) + H.T @ (W[:, None] * H))
-    turn = K * np.eye(3 * N) - stiff
-    error = np.diagonal(turn @ covariance @ turn.T).reshape(N, 3).sum(axis=1)
-    D *= np.maximum(1 - DOUBT * error / np.sum(D**2, axis=0), 0)
+    dD_dx = K * np.eye(3 * N) - stiff
+    error = np.diagonal(dD_dx @ covariance @ dD_dx.T).reshape(N, 3).sum(axis=1)
+    D *= np.maximum(1 - CONFIG.error_weight * error / np.sum(D**2, axis=0), 0)
     e = ((1 - each) * internal.ravel() + each * K * d.ravel() + H @ (np.asarray(seen.y) - x).ravel())[free]
     D, N_inverse = D[free], np.linalg.inv((V + H @ R @ H.T)[np.ix_(free, free)])
     expected = D.T @ N_inverse @ D
     np.testing.assert_allclose(found.precision, expected, atol=1e-7 * np.abs(expected).max())
-    pulled = -D.T @ N_inverse @ e
-    np.testing.assert_allclose(found.pulled, pulled, atol=1e-6 * np.abs(pulled).max())
-    np.testing.assert_allclose(found.squared, e @ N_inverse @ e, rtol=1e-6)
-    np.testing.assert_allclose(found.shift, pulled + expected @ s, atol=1e-6 * np.abs(expected @ s).max())
+    score = -D.T @ N_inverse @ e
+    np.testing.assert_allclose(found.score, score, atol=1e-6 * np.abs(score).max())
+    np.testing.assert_allclose(found.chi2, e @ N_inverse @ e, rtol=1e-6)
+    np.testing.assert_allclose(found.shift, score + expected @ s, atol=1e-6 * np.abs(expected @ s).max())
 
 
-def test_the_slope_is_the_derivative_of_the_balance(balance):
+def test_dr_ds_is_the_derivative_of_the_residual_force(balance):
     frame = lifts()[3]
     seen, x = evidence(frame, 1), jnp.asarray(frame.x)
     s, step = jnp.asarray(np.random.default_rng(1).uniform(0, 1, N)), 1e-6
     linearised = eqx.filter_jit(balance.linearise)
     ahead, behind, here = (linearised(x, s + move, seen) for move in (step, -step, 0.0))
     difference = (ahead.unbalanced - behind.unbalanced) / (2 * step)
-    np.testing.assert_allclose(here.slope, difference, atol=1e-8)
+    np.testing.assert_allclose(here.dr_ds, difference, atol=1e-8)
 
 
 def test_at_a_weld_the_reaction_force_shows(balance):
@@ -91,7 +96,7 @@ def test_at_a_weld_the_reaction_force_shows(balance):
 
 
 def test_twenty_frames_in_which_nothing_moved_leave_s_unknown(balance):
-    """All slopes are then error, and what chance leaves of them must not add up: an s in [0, 1] has 0.29 by itself."""
+    """Every D is then error, which must not add up over frames: 0.29 is the standard deviation of any s in [0, 1]."""
     frame = lifts()[0]
     np.testing.assert_array_equal(frame.x, sheet().rest)
     search = eqx.filter_jit(lambda seen: balance.approach(seen.y, jnp.zeros(N), seen).x)
@@ -100,14 +105,12 @@ def test_twenty_frames_in_which_nothing_moved_leave_s_unknown(balance):
     assert np.median(np.sum([np.diagonal(one) for one in found], axis=0)[~frame.held]) < 1 / 0.5**2
 
 
-def test_a_search_that_is_cut_off_says_so(balance, monkeypatch):
+def test_a_search_that_is_cut_off_says_so(balance):
     """From what was seen, crumpled by its noise, it takes several steps; one is not enough."""
     seen, s = evidence(lifts()[3], 3), jnp.zeros(N)
-    search = eqx.filter_jit(lambda: balance.approach(seen.y, s, seen).converged)
-    assert search()
-    monkeypatch.setattr(force_balance, "STATE_STEPS", 1)
-    cut_off = eqx.filter_jit(lambda: balance.approach(seen.y, s, seen).converged)
-    assert not cut_off()
+    search = eqx.filter_jit(lambda balance: balance.approach(seen.y, s, seen).converged)
+    assert search(balance)
+    assert not search(replace(balance, config=FilterConfig(max_state_steps=1)))
 
 
 def test_evidence_only_sharpens(balance):

@@ -1,4 +1,4 @@
-"""Noise learned from what is left unexplained: kept where it is right, widened where it is not."""
+"""Noise learned from residuals is kept where it is right, and inflated where it is too small."""
 
 from functools import reduce
 from operator import add
@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.filters.evidence import PosteriorSummary
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
-from jiggle_mj.estimator.filters.implicit import ImplicitFilter
 from jiggle_mj.estimator.filters.noise import ForceResiduals, Noise
-from tests.support.small_sheet import NOISE, attached, follow, lifts, observed, sheet_balance
+from jiggle_mj.estimator.filters.posterior_summary import PosteriorSummary
+from tests.support.small_sheet import NOISE, attached, follow, lifts, observed, sheet_balance, sheet_filter
 
 FORCE_SD = 1e-3
 DRAWS = 60
@@ -21,25 +20,25 @@ DRAWS = 60
 
 @pytest.fixture(scope="module")
 def drawn() -> list[ForceResiduals]:
-    """Of frames whose errors are drawn from the model, linear around a lifted state with half of s rigid."""
+    """Return residuals of frames with errors drawn from the model, at a lifted state with s = 0.5 attached."""
     balance, truth = sheet_balance(FORCE_SD), lifts()[3]
     seen, s = observed(truth, 0), jnp.asarray(0.5 * attached())
     frame = eqx.filter_jit(balance.linearise)(jnp.asarray(truth.x), s, seen)
 
     @eqx.filter_jit
-    def misfit(balance: ForceBalance, draw: jax.Array) -> ForceResiduals:
+    def residuals(balance: ForceBalance, draw: jax.Array) -> ForceResiduals:
         own, others = jax.random.normal(draw, (2, *frame.x.shape))
         sd = jnp.where(frame.weight > 0, 1 / jnp.sqrt(frame.weight), 0.0)
         seen_sd = 1 / jnp.sqrt(seen.precision[:, 0, 0])
         parts = sd[:, None] * own, seen_sd[:, None] * others
-        off_balance = eqx.tree_at(lambda one: (one.unbalanced, one.off), frame, parts)
-        return balance.misfit(off_balance, balance.fit(off_balance), seen)
+        off_balance = eqx.tree_at(lambda one: (one.unbalanced, one.innovation), frame, parts)
+        return balance.residuals(off_balance, balance.fit(off_balance), seen)
 
-    return [misfit(balance, key) for key in jax.random.split(jax.random.key(0), DRAWS)]
+    return [residuals(balance, key) for key in jax.random.split(jax.random.key(0), DRAWS)]
 
 
 def test_squares_equal_the_degrees_of_freedom_where_the_noise_is_right(drawn):
-    """Forces and positions apart, over single frames and over sums of them; four standard errors."""
+    """For forces and positions separately, over single frames and over their sum; the bars are four standard errors."""
     for name in ("force", "position"):
         ratio = [float(jnp.sum(getattr(one, name) ** 2) / getattr(one, f"{name}_degrees")) for one in drawn]
         assert np.mean(ratio) == pytest.approx(1, abs=4 * np.std(ratio) / np.sqrt(DRAWS)), name
@@ -50,13 +49,13 @@ def test_squares_equal_the_degrees_of_freedom_where_the_noise_is_right(drawn):
 
 
 def test_an_error_that_persists_counts_by_its_sum(drawn):
-    """Ten frames with one and the same error are worth one of them, not ten."""
+    """Ten frames with the same error count as one of them, not as ten."""
     persistent = reduce(add, [drawn[0]] * 10)
     single = float(jnp.sum(drawn[0].force ** 2) / drawn[0].force_degrees)
     assert Noise().learned([persistent]).force == pytest.approx(10 * single)
 
 
-def test_noise_is_never_narrower_than_typed_and_keeps_still_about_right(drawn):
+def test_noise_is_never_smaller_than_assumed_and_stays_where_it_is_about_right(drawn):
     tenth = 0.1 * drawn[0].force, 0.1 * drawn[0].position
     small = eqx.tree_at(lambda one: (one.force, one.position), drawn[0], tenth)
     assert Noise().learned([small]) == Noise()
@@ -76,26 +75,25 @@ def test_the_filter_finds_how_noisy_positions_are(runs, times):
     assert noise.position == pytest.approx(times**2, rel=0.2)
 
 
-def test_positions_noisier_than_stated_do_not_make_the_filter_report_what_is_not_there(runs, monkeypatch):
-    """It misses what it can no longer see; without learning it reports free particles too, and is surer than right."""
+def test_positions_noisier_than_stated_do_not_make_the_filter_report_what_is_not_there(runs):
+    """It misses what it can no longer see. Without learning it reports free particles too, and is overconfident."""
     _, learned = runs[4]
-    monkeypatch.setattr(Noise, "learned", lambda noise, _: noise)
-    _, typed = run(4)
-    wrong = [int((found(one) & ~attached()).sum()) for one in (learned, typed)]
+    _, assumed = run(4, learns_noise=False)
+    wrong = [int((found(one) & ~attached()).sum()) for one in (learned, assumed)]
     assert wrong[0] == 0 < wrong[1]
-    assert surprise(learned) < 0.6 * surprise(typed)
+    assert surprise(learned) < 0.6 * surprise(assumed)
 
 
-def run(times: float) -> tuple[Noise, PosteriorSummary]:
-    """All lifts, with that many times the stated noise."""
-    filter, rng = ImplicitFilter(sheet_balance(1e-4)), np.random.default_rng(1)
+def run(times: float, *, learns_noise: bool = True) -> tuple[Noise, PosteriorSummary]:
+    """Return noise and posterior after all lifts, with that many times the stated noise."""
+    filter, rng = sheet_filter(1e-4, learns_noise=learns_noise), np.random.default_rng(1)
     noisy = [frame.x + times * NOISE * rng.normal(size=frame.x.shape) for frame in lifts()]
     seen = [
         eqx.tree_at(lambda one: one.y, observed(frame, 0), jnp.asarray(y))
         for frame, y in zip(lifts(), noisy, strict=True)
     ]
-    _, summary = follow(filter, lifts(), seen)
-    return filter.noise, summary
+    state, _, summary = follow(filter, lifts(), seen)
+    return filter.noise(state), summary
 
 
 def found(summary: PosteriorSummary) -> np.ndarray:
@@ -103,6 +101,6 @@ def found(summary: PosteriorSummary) -> np.ndarray:
 
 
 def surprise(summary: PosteriorSummary) -> float:
-    """Mean negative logarithm of what P(attached) says of the truth [nat]."""
+    """Return the mean negative log probability of the truth by P(attached) [nat]."""
     of_truth = np.where(attached(), summary.probability, 1 - np.asarray(summary.probability))
     return float(-np.mean(np.log(of_truth)))

@@ -79,7 +79,7 @@ class Seen(Estimator):
     def release(self):
         pass
 
-    def worked(self, change):
+    def change_log_bayes_factor(self, change):
         return self.factors.pop(0) if len(self.factors) > 1 else self.factors[0]
 
 

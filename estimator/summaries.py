@@ -1,20 +1,21 @@
-"""What a filter states, as the estimator says it: the belief in N/m, and which particles are called attached."""
+"""A filter's posterior as the estimator publishes it: the belief in N/m, and which particles are called attached."""
 
 import numpy as np
 
 from jiggle_mj.estimate import Belief, Detection
 from jiggle_mj.observation import Declaration
 
-from ..config import EstimatorConfig
-from ..filters.evidence import Filter, PosteriorSummary
-from .boundary_belief import BoundaryBelief
+from .belief.boundary_belief import BoundaryBelief
+from .config import EstimatorConfig
+from .filters.noise import Noise
+from .filters.posterior_summary import Convergence, PosteriorSummary
 
 RULE = "P(attached) > 0.5"
-"""Of filters that state a probability."""
+"""Rule of detection for filters that give a probability."""
 
 
 def belief(summary: PosteriorSummary) -> Belief:
-    """Mean, covariance and, of beliefs in a bounded stiffness, intervals."""
+    """Return mean and covariance, and the 90 % intervals of a belief over bounded stiffnesses."""
     mean, covariance = summary.belief.moments()
     if isinstance(summary.belief, BoundaryBelief):
         return Belief(mean=np.asarray(mean), covariance=np.asarray(covariance))
@@ -29,12 +30,24 @@ def belief(summary: PosteriorSummary) -> Belief:
 
 
 def detection(
-    summary: PosteriorSummary, filter: Filter, declaration: Declaration, config: EstimatorConfig, *, converged: bool
+    summary: PosteriorSummary,
+    declaration: Declaration,
+    config: EstimatorConfig,
+    *,
+    noise: Noise | None,
+    refined: Convergence,
 ) -> Detection:
-    """By P(attached) where it is stated, else by the mean; `converged`: whether samples, at the end, agreed."""
-    b, sd, probability = (np.asarray(one) for one in (summary.b, summary.sd, summary.probability))
+    """Return which particles are called attached: by P(attached) where the filter gives it, else by the mean of b.
+
+    Args:
+        summary: the posterior.
+        declaration: its membrane stiffness k is the unit of `EstimatorConfig.detect_above`.
+        config: the settings.
+        noise: factors on the assumed variances; None where they are not learned.
+        refined: how the last refinement at a release ended.
+    """
+    b, sd, probability = (np.asarray(part) for part in (summary.b, summary.sd, summary.probability))
     if np.isfinite(probability).all():
-        noise = filter.noise
         return Detection(
             attached=probability > 0.5,
             score=probability,
@@ -42,7 +55,7 @@ def detection(
             stiffness_sd=sd,
             probabilistic=True,
             rule=RULE,
-            converged=converged,
+            converged=refined is not Convergence.SAMPLES_DISAGREE,
             force_sd_ratio=None if noise is None else noise.force**0.5,
             position_sd_ratio=None if noise is None else noise.position**0.5,
         )

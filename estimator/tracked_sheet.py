@@ -1,0 +1,57 @@
+"""What the estimator builds once the sheet's rest shape is known, and keeps from frame to frame."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jiggle_mj.estimate import Sheet
+from jiggle_mj.mesh_checks import check_unfolded
+from jiggle_mj.observation import Declaration
+from jiggle_mj.sheet_triangulation import SheetPlane
+
+from .config import EstimatorConfig
+from .filters.build import build_filter
+from .filters.filter import Filter, FilterState
+from .perception.mesh_field import MeshField
+from .physics.mesh import SheetMesh
+
+
+@dataclass(kw_only=True)
+class TrackedSheet:
+    """One sheet with its filter, the filter's state, and the latest positions."""
+
+    filter: Filter[Any]
+    """The rule of update."""
+    field: MeshField
+    """Fills unseen particles from their surroundings."""
+    prior_entropy: float
+    """Entropy of the belief before the first frame [nat]."""
+    state: FilterState
+    """The filter's state after the latest frame."""
+    x: Float[np.ndarray, "n 3"]
+    """Positions after the latest frame with closed jaws, at first at rest [m]."""
+    open_x: Float[np.ndarray, "n 3"]
+    """Positions with open jaws when they were last asked for, at first at rest [m]."""
+
+    @classmethod
+    def build(cls, sheet: Sheet, declaration: Declaration, config: EstimatorConfig) -> "TrackedSheet":
+        """Build the filter for a sheet at rest.
+
+        Raises:
+            MeshError: the sheet is folded, or not one sheet.
+        """
+        mesh, plane = SheetMesh(sheet.rest, sheet.faces), SheetPlane.through(sheet.rest)
+        check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
+        filter = build_filter(mesh, declaration, config)
+        state = filter.init(jax.random.key(config.seed))
+        return cls(
+            filter=filter,
+            field=MeshField(plane.flatten(mesh.rest), mesh.faces),
+            prior_entropy=float(state.summary.entropy),
+            state=state,
+            x=mesh.rest,
+            open_x=mesh.rest,
+        )
