@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..belief.attachment_belief import AttachmentBelief
+from ..belief.gaussian_information import GaussianInformation
 from ..filters.implicit import likeliest, quick_summary
 from ..filters.posterior_summary import PosteriorSummary
 from .every_frame import cost_under, directions, linearised, weighed
@@ -275,28 +276,23 @@ def _by_one_factor(problem: Problem, now: Fitted) -> Step:
 def _towards(problem: Problem, now: Fitted, to: Float[np.ndarray, " n"]) -> Step:
     """To some s, with the parameters that fit it best."""
     point, free, sd = now.point, now.free, problem.sd(now.named)
-    A, C, gt = _of_parameters(now.square, point, free, sd)
+    best = _joint(now.square, point, free, sd).condition(s=to - point.s).mean()
     theta = np.zeros(len(point.theta))
-    theta[free] = np.clip(-np.linalg.solve(A, gt + C.T @ (to - point.s)), -FAR * sd, FAR * sd)
+    theta[free] = np.clip(best, -FAR * sd, FAR * sd)
     return theta, to - point.s
 
 
 def _summary(problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> PosteriorSummary:
     """What is believed of the attachments there, the parameters marginalised."""
-    n = len(point.s)
-    A, C, gt = _of_parameters(square, point, free, sd)
-    L = square[:n, :n] - C @ np.linalg.solve(A, C.T)
-    shift = L @ point.s - square[:n, -1] + C @ np.linalg.solve(A, gt)
-    return quick_summary(problem.prior.add(jnp.asarray(L), jnp.asarray(shift)))
+    step = _joint(square, point, free, sd).marginal("s")
+    shift = step.precision @ point.s + step.shift
+    return quick_summary(problem.prior.add(jnp.asarray(step.precision), jnp.asarray(shift)))
 
 
-def _of_parameters(
-    square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray
-) -> tuple[Float[np.ndarray, "d d"], Float[np.ndarray, "n d"], Float[np.ndarray, " d"]]:
-    """Of normal equations and prior: the free parameters' own, those with s, and the gradient."""
-    n, d = len(point.s), len(free)
-    own = square[n : n + d, n : n + d] + np.diag(sd**-2)
-    return own, square[:n, n : n + d], square[n : n + d, -1] + point.theta[free] / sd**2
+def _joint(square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> GaussianInformation:
+    """Return the information about steps of s and of the free parameters, with the prior of the parameters."""
+    joint = GaussianInformation.from_normal_equations(square, s=len(point.s), theta=len(free))
+    return joint.with_independent("theta", sd**-2, -point.theta[free] / sd**2)
 
 
 def _cost(problem: Problem, weights: dict[int, Metric], point: Point, named: np.ndarray) -> float:

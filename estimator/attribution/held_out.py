@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import norm
 
+from ..belief.gaussian_information import GaussianInformation
 from ..parallel_map import parallel_map
 from .closed_frames import ClosedFrame
 from .every_frame import weighed
@@ -113,10 +114,9 @@ def from_rest(problem: Problem, point: Point, frames: list[int], *, by_tool: boo
 def _covariance(problem: Problem, fitted: Fitted) -> Float[np.ndarray, "n n"]:
     """Of a fit's s."""
     n, d = len(fitted.site_precision), len(fitted.free)
-    precision = fitted.square[:-1, :-1].copy()
-    precision[np.arange(n), np.arange(n)] += fitted.site_precision
-    precision[np.arange(n, n + d), np.arange(n, n + d)] += problem.sd(fitted.named) ** -2
-    return np.linalg.inv(precision)[:n, :n]
+    joint = GaussianInformation.from_normal_equations(fitted.square, s=n, theta=d)
+    joint = joint.with_independent("s", fitted.site_precision)
+    return np.asarray(joint.with_independent("theta", problem.sd(fitted.named) ** -2).covariance("s"))
 
 
 def _sd(

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from ..belief.gaussian_information import GaussianInformation
 from .closed_frames import ClosedFrame
 from .linear import N_FIELDS, NormalEquations, grasp_sd, tool_sd
 from .problem import Problem
@@ -28,11 +29,11 @@ def reduced(problem: Problem, equations: dict[int, NormalEquations], d: int) -> 
 
 def without_stiffnesses(
     square: Float[np.ndarray, "k k"], site_precision: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "j j"]:
-    """Normal equations over all but s, with s eliminated as far as the belief leaves it open."""
+) -> GaussianInformation:
+    """Return the information about all parameters but s, with s marginalised under the sites of the belief."""
     n = len(site_precision)
-    beside = square[n:, :n]
-    return square[n:, n:] - beside @ np.linalg.solve(square[:n, :n] + np.diag(site_precision), beside.T)
+    joint = GaussianInformation.from_normal_equations(square, s=n, theta=len(square) - 1 - n)
+    return joint.with_independent("s", site_precision).marginal("theta")
 
 
 def less_offset(rows: Float[np.ndarray, "t 3 a"], frame: ClosedFrame) -> Float[np.ndarray, "a a"]:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
+from ..belief.gaussian_information import GaussianInformation
 from ..effects.effect import Effect
 from .every_frame import cost_under, directions, linearised
 from .fit import Fitted, fit, gains_over, moved
@@ -66,11 +67,10 @@ def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " 
     if not len(fitted.named):
         return 0.0, np.zeros(0)
     d, sd = len(fitted.named), problem.sd(fitted.named)
-    left = without_stiffnesses(fitted.square, fitted.site_precision)[:-1, :-1]
-    own = left[d:, d:] + np.diag(sd[d:] ** -2)
-    V = left[:d, :d] - left[:d, d:] @ np.linalg.solve(own, left[d:, :d])
-    unit = V * np.outer(sd[:d], sd[:d]) + np.eye(d)
-    return 0.5 * float(np.linalg.slogdet(unit)[1]), sd[:d] * np.sqrt(np.diag(np.linalg.inv(unit)))
+    free = without_stiffnesses(fitted.square, fitted.site_precision).named(named=d, nuisance=len(sd) - d)
+    V = free.with_independent("nuisance", sd[d:] ** -2).marginal("named").precision
+    scaled = GaussianInformation(precision=V * np.outer(sd[:d], sd[:d]) + np.eye(d), shift=np.zeros(d))
+    return 0.5 * float(scaled.log_det()), sd[:d] * np.sqrt(np.asarray(scaled.variances()))
 
 
 def bayes_factor(problem: Problem, better: Fitted, plain: Fitted, sites: int) -> tuple[float, float]:
@@ -85,23 +85,20 @@ def bayes_factor(problem: Problem, better: Fitted, plain: Fitted, sites: int) ->
 
 
 def _one(
-    problem: Problem, fitted: Fitted, effect: Effect, site: int, left: Float[np.ndarray, "j j"], whole: np.ndarray
+    problem: Problem, fitted: Fitted, effect: Effect, site: int, left: GaussianInformation, whole: np.ndarray
 ) -> Score:
-    """At one place, from normal equations over all parameters and -1, with and without s eliminated."""
+    """Return the score at one place, from the information with s marginalised, and the products of all columns."""
     mine = problem.sheet.place(effect.name, site)
     others = ~np.isin(fitted.free, mine)
     rest, sd_rest = fitted.free[others], problem.sd(fitted.named)[others]
-    free = left[np.ix_(rest, rest)] + np.diag(sd_rest**-2)
-    pulled = left[np.ix_(rest, np.append(mine, len(left) - 1))]
-    pulled[:, -1] += fitted.around.theta[rest] / sd_rest**2
-    pull = np.linalg.solve(free, pulled)
-    V = left[np.ix_(mine, mine)] - left[np.ix_(mine, rest)] @ pull[:, :-1]
-    g = -(left[mine, -1] - left[np.ix_(mine, rest)] @ pull[:, -1])
-    sd = problem.prior_sd[mine]
-    unit, scaled, eye = V * np.outer(sd, sd), g * sd, np.eye(len(mine))
-    theta = np.linalg.solve(unit + eye, scaled)
+    joint = left.restricted(effect=mine, nuisance=rest)
+    joint = joint.with_independent("nuisance", sd_rest**-2, -fitted.around.theta[rest] / sd_rest**2)
+    own, sd, eye = joint.marginal("effect"), problem.prior_sd[mine], np.eye(len(mine))
+    unit, scaled = own.precision * np.outer(sd, sd), own.shift * sd
+    posterior = GaussianInformation(precision=unit + eye, shift=scaled)
+    theta = posterior.mean()
     senseless = effect.non_negative and theta[0] < 0
-    evidence = (0.0 if senseless else 0.5 * scaled @ theta) - 0.5 * np.linalg.slogdet(eye + unit)[1]
+    evidence = (0.0 if senseless else 0.5 * scaled @ theta) - 0.5 * posterior.log_det()
     faint = 1e-9 * max(float(np.trace(unit)), 1e-30)
     statistic = float(scaled @ np.linalg.solve(unit + faint * eye, scaled))
     raw = whole[np.ix_(mine, mine)] * np.outer(sd, sd)

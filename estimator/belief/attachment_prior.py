@@ -1,7 +1,7 @@
-"""What is believed of a sheet's attachments before anything is seen.
+"""Prior of which particles are attached, and how stiffly.
 
-A particle is free or attached (`spike_and_slab`), the likelier attached the more of its neighbours are: an Ising prior
-over the mesh [Besag 1986, doi:10.1111/j.2517-6161.1986.tb01412.x],
+A particle is free or attached (`spike_and_slab`), and the likelier attached the more of its neighbours are: an Ising
+prior over the mesh [Besag 1986, doi:10.1111/j.2517-6161.1986.tb01412.x],
 
     p(attached) ~ exp(h sum_i a_i + J sum_ij a_i a_j)    a_i in {0, 1}, ij the mesh's edges.
 """
@@ -16,17 +16,18 @@ from .spike_and_slab import SpikeAndSlab
 
 
 class AttachmentPrior(eqx.Module):
-    """Free or attached, and how stiffly."""
+    """Prior over free and attached on the mesh, and over the stiffness of what is attached."""
 
     stiffness: SpikeAndSlab
+    """Prior of each particle's s."""
     log_odds: Float[Array, " n"]
-    """h: of each particle without attached neighbours; the same for all, but where something was cut or sewn."""
+    """Log odds h of a particle without attached neighbours; equal for all, except where something was cut or sewn."""
     coupling: Float[Array, ""]
-    """J: what each attached neighbour adds to the log odds."""
+    """Coupling J, which each attached neighbour adds to the log odds."""
     neighbours: Int[Array, "n d"]
-    """Of each particle along the mesh's edges, padded with n."""
+    """Neighbours of each particle along the mesh's edges, padded with n."""
     back: Int[Array, "n d"]
-    """Which place the particle has among the neighbours of each of its neighbours."""
+    """Index of the particle among the neighbours of each of its neighbours."""
 
     @classmethod
     def build(
@@ -38,7 +39,7 @@ class AttachmentPrior(eqx.Module):
         probability: float,
         coupling: float,
     ) -> "AttachmentPrior":
-        """For n particles; `probability` is that of one none of whose neighbours is attached."""
+        """Return the prior of n particles; `probability` is P(attached) of one without attached neighbours."""
         table = neighbour_table(symmetric(n, edges))
         return cls(
             stiffness=stiffness,
@@ -48,30 +49,30 @@ class AttachmentPrior(eqx.Module):
             back=jnp.asarray(places_back(table)),
         )
 
-    def parted(
+    def isolated(
         self, region: Bool[Array, " n"], probability: Float[Array, " n"], message: Float[Array, "n d"]
     ) -> tuple["AttachmentPrior", Float[Array, "n d"]]:
-        """After something was done to a region: it has odds of its own, and its edge to the others is no edge now.
+        """Return the prior after a cut or suture of a region: with its own odds and no edge to other particles.
 
-        What the region told the others of what was before stays with them.
+        What the region's old state added to the odds of its neighbours stays in their odds.
 
         Args:
             region: the particles.
             probability: P(attached) of each from now on; used in the region alone.
-            message: log odds that each neighbour told.
+            message: log odds that each neighbour added so far.
 
         Returns:
-            The prior, and what neighbours tell from now on.
+            The prior, and the log odds that each neighbour adds from now on.
         """
         inside = jnp.append(region, False)[self.neighbours]
         across = (inside != region[:, None]) & (self.neighbours < len(region))
-        tells = jnp.append(jnp.log1p(probability * jnp.expm1(self.coupling)), 0.0)[self.neighbours]
-        told = jnp.where(across, 0.0, jnp.where(region[:, None], tells, message))
-        odds = jnp.log(probability) - jnp.log1p(-probability) - jnp.sum(told, axis=1)
+        from_inside = jnp.append(jnp.log1p(probability * jnp.expm1(self.coupling)), 0.0)[self.neighbours]
+        new_message = jnp.where(across, 0.0, jnp.where(region[:, None], from_inside, message))
+        odds = jnp.log(probability) - jnp.log1p(-probability) - jnp.sum(new_message, axis=1)
         kept = self.log_odds + jnp.sum(jnp.where(across, message, 0.0), axis=1)
         changed = eqx.tree_at(
             lambda prior: (prior.log_odds, prior.neighbours),
             self,
             (jnp.where(region, odds, kept), jnp.where(across, len(region), self.neighbours)),
         )
-        return changed, told
+        return changed, new_message

@@ -1,9 +1,9 @@
-"""Cuts and sutures as the belief takes them: what was meant is known, whether it worked is to be seen.
+"""Cuts and sutures in the belief: the intended result is known, its success is inferred.
 
-The paper adds delta_b to the mean and W to the covariance. Here a particle of the region is free or attached with the
-odds that the act fails or holds, and what was seen of it before says nothing any more. Whether the act worked is asked
-of the region as a whole: the frames since then are likelier under one of two beliefs, that in which nothing has changed
-and that in which all of the region has become what was meant.
+The paper adds delta_b to the mean and W to the covariance. Here each particle of the region is free or attached with
+the odds that a cut or suture fails or succeeds, and evidence about its old attachment no longer counts. Whether the act
+succeeded is asked of the region as a whole, by the evidence of the frames since then: under the belief in which nothing
+has changed, and under that in which all of the region has become as intended.
 """
 
 from dataclasses import dataclass, field
@@ -19,46 +19,48 @@ from jiggle_mj.regions import distance_to_path
 from .attachment_belief import AttachmentBelief
 from .prior import PriorConfig
 
-FAILS = 0.1
-"""Chance that a cut or suture has not worked, before anything is seen of it."""
+FAILURE_PROBABILITY = 0.1
+"""Probability that a cut or suture had no effect, before any frame shows it."""
+MIN_PROBABILITY = 1e-6
+"""Smallest distance of P(attached) from 0 and 1 after a cut or suture, so that later evidence can still change it."""
 
 
 @dataclass(kw_only=True)
 class Change:
-    """One cut or suture, and what was believed before it."""
+    """One cut or suture, and the belief before it."""
 
     event: Cut | Suture
     index: int
-    """Of the first observation after it."""
+    """Index of the first observation after it."""
     region: Bool[np.ndarray, " n"]
     before: AttachmentBelief = field(repr=False)
     evidence: tuple[Float[Array, "n n"], Float[Array, " n"]] | None = field(default=None, repr=False)
-    """What the frames until the next change said of s, in information form; None where there were none, or are yet."""
+    """Evidence about s of the frames until the next change, in information form; None where there is none so far."""
 
     def log_bayes_factor(self, precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> float:
-        """Ln p(evidence | it worked) / p(evidence | nothing changed), for evidence since then in information form.
+        """Return ln p(evidence | success) / p(evidence | nothing changed) of evidence since then, in information form.
 
-        Of a cut, worked means that all of the region is free; of a suture, that all of it holds as was meant.
+        After a successful cut all of the region is free; after a successful suture it has the intended stiffness.
         """
-        meant = jnp.asarray(meant_by(self.event))
-        return float(_log_bayes_factor(self.before, jnp.asarray(self.region), meant, precision, shift))
+        intended = jnp.asarray(meant_by(self.event))
+        return float(_log_bayes_factor(self.before, jnp.asarray(self.region), intended, precision, shift))
 
 
 def meant_by(event: Cut | Suture) -> float:
-    """Stiffness that each particle of the region is to have [N/m]."""
+    """Return the stiffness that each particle of the region is intended to have [N/m]."""
     return event.stiffness if isinstance(event, Suture) else 0.0
 
 
 def region_of(event: Cut | Suture, rest: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Particles that a cut or suture is meant for; all False where it misses the sheet."""
+    """Return the particles that a cut or suture acts on; all False where it misses the sheet."""
     return distance_to_path(rest[:, :2], np.asarray(event.path, dtype=float)) <= event.width / 2
 
 
 def after(belief: AttachmentBelief, event: Cut | Suture, region: Bool[np.ndarray, " n"]) -> AttachmentBelief:
-    """The belief right after a cut or suture; sweep it before asking.
+    """Return the belief right after a cut or suture; sweep it before reading it.
 
-    What was sewn is about as stiff as was meant if it holds. That is said as one measurement of s, so wide that free is
-    not ruled out by it; what it says of free against attached is taken back from the odds.
+    A suture that succeeds has about the intended stiffness. That enters as one measurement of s whose standard
+    deviation is s itself, so that free is not excluded. Its Bayes factor for attached is subtracted from the odds.
     """
     where = jnp.asarray(region)
     return _cut(belief, where) if isinstance(event, Cut) else _sewn(belief, where, jnp.asarray(event.stiffness))
@@ -66,18 +68,24 @@ def after(belief: AttachmentBelief, event: Cut | Suture, region: Bool[np.ndarray
 
 @eqx.filter_jit
 def _cut(belief: AttachmentBelief, where: Bool[Array, " n"]) -> AttachmentBelief:
-    return belief.changed(where, jnp.clip(FAILS * belief.mixture().attached, LEAST, 1 - LEAST))
+    return belief.changed(where, _clipped(FAILURE_PROBABILITY * belief.mixture().attached))
 
 
 @eqx.filter_jit
 def _sewn(belief: AttachmentBelief, where: Bool[Array, " n"], stiffness: Float[Array, ""]) -> AttachmentBelief:
     attached = belief.mixture().attached
-    changed = belief.changed(where, jnp.clip(1 - FAILS * (1 - attached), LEAST, 1 - LEAST))
-    meant = belief.bounded(jnp.full(len(where), stiffness))
+    changed = belief.changed(where, _clipped(1 - FAILURE_PROBABILITY * (1 - attached)))
+    intended = belief.bounded(jnp.full(len(where), stiffness))
     odds = changed.prior.log_odds
-    _, factor = changed.prior.stiffness.posterior(meant, meant**2, odds)
-    changed = eqx.tree_at(lambda one: one.prior.log_odds, changed, jnp.where(where, odds - factor, odds))
-    return changed.add(jnp.diag(jnp.where(where, meant**-2, 0.0)), jnp.where(where, 1 / meant, 0.0))
+    _, log_bayes_factor = changed.prior.stiffness.posterior(intended, intended**2, odds)
+    changed = eqx.tree_at(
+        lambda belief: belief.prior.log_odds, changed, jnp.where(where, odds - log_bayes_factor, odds)
+    )
+    return changed.add(jnp.diag(jnp.where(where, intended**-2, 0.0)), jnp.where(where, 1 / intended, 0.0))
+
+
+def _clipped(probability: Float[Array, " n"]) -> Float[Array, " n"]:
+    return jnp.clip(probability, MIN_PROBABILITY, 1 - MIN_PROBABILITY)
 
 
 @eqx.filter_jit
@@ -88,11 +96,7 @@ def _log_bayes_factor(
     precision: Float[Array, "n n"],
     shift: Float[Array, " n"],
 ) -> Float[Array, ""]:
-    meant = before.bounded(jnp.full(len(region), stiffness))
+    intended = before.bounded(jnp.full(len(region), stiffness))
     prior = PriorConfig()
-    worked = before.fixed(region, meant, jnp.maximum(prior.spread * meant, prior.spike))
-    return worked.evidence_for(precision, shift) - before.evidence_for(precision, shift)
-
-
-LEAST = 1e-6
-"""No particle is surer to be free or attached after a cut or suture."""
+    success = before.fixed(region, intended, jnp.maximum(prior.spread * intended, prior.spike))
+    return success.evidence_for(precision, shift) - before.evidence_for(precision, shift)

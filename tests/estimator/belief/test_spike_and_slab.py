@@ -1,5 +1,7 @@
 """Free or attached: odds, moments and quantiles against numerical integration."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,20 +9,22 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from jiggle_mj.estimator.belief.spike_and_slab import LEARNED, Mixture, SpikeAndSlab
+from jiggle_mj.estimator.belief.spike_and_slab import Mixture, SpikeAndSlab
 
 SPIKE, COMPONENTS, SPREAD = 3e-3, (0.01, 0.1, 1.0), 0.5
 LOG_ODDS = -3.0
+RATE = 0.2
+"""Share of a step of expectation maximisation that each call takes."""
 PRIOR = SpikeAndSlab.build(spike=SPIKE, components=COMPONENTS, spread=SPREAD, dirichlet_strength=3.0, partial=0.0)
 
 posterior = eqx.filter_jit(SpikeAndSlab.posterior)
-learned_from = eqx.filter_jit(SpikeAndSlab.learned)
+learned_from = eqx.filter_jit(partial(SpikeAndSlab.learned, rate=RATE))
 drawn_for = eqx.filter_jit(SpikeAndSlab.drawn)
 moments, quantile = eqx.filter_jit(Mixture.moments), eqx.filter_jit(Mixture.quantile)
 
 
 def density(mean: float, variance: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """A grid, the posterior on it, and the log Bayes factor."""
+    """Return a grid, the posterior on it, and the log Bayes factor."""
     s = np.unique(np.concatenate([np.linspace(0, 1, 100_001), np.linspace(0, 0.03, 100_001)]))
     seen = np.exp(norm.logpdf(s, mean, np.sqrt(variance)) - norm.logpdf(np.clip(mean, 0, 1), mean, np.sqrt(variance)))
 
@@ -62,9 +66,9 @@ def test_far_out_in_the_tails_nothing_overflows():
     np.testing.assert_allclose(quantile(mixture, 0.5), [0, 0.3, 1], atol=1e-4)
 
 
-def test_the_shares_are_those_of_the_particles_called_attached():
-    """Twenty on one rung, measured well; two free ones, one of which nothing is known, and two that are only called
-    attached because their neighbours are, count nothing."""
+def test_the_weights_are_those_of_the_particles_called_attached():
+    """Twenty on one component, measured well. Not counted are two free ones, one that was not measured, and two that
+    are called attached only because their neighbours are."""
     mean = jnp.array([0.1] * 20 + [0.0, 0.0, 0.5, 0.0, 0.0])
     variance = jnp.array([1e-6] * 22 + [1e6, 1e-6, 1e-6])
     odds = jnp.array([LOG_ODDS] * 23 + [20.0, 20.0])
@@ -76,13 +80,13 @@ def test_the_shares_are_those_of_the_particles_called_attached():
     on_it = np.asarray(mixture.weight[2, :20]).sum()
     assert float(learned.share[1]) == pytest.approx((1 + on_it) / 23, rel=1e-6)
     assert float(jnp.sum(learned.share)) == pytest.approx(1)
-    np.testing.assert_allclose(once.share, PRIOR.share + LEARNED * (learned.share - PRIOR.share), rtol=1e-5)
+    np.testing.assert_allclose(once.share, PRIOR.share + RATE * (learned.share - PRIOR.share), rtol=1e-5)
     nobody, factor = posterior(PRIOR, jnp.zeros(4), jnp.full(4, 1e-6), jnp.full(4, LOG_ODDS))
     np.testing.assert_allclose(learned_from(PRIOR, nobody, factor).share, 1 / 3)
 
 
-def test_a_part_of_an_attachment_is_on_the_nearest_softer_rung():
-    """A million parts, as likely as one another, of the b = s / (1 - s) of each rung."""
+def test_a_part_of_an_attachment_has_the_nearest_softer_component():
+    """A million equally likely parts of the b = s / (1 - s) of each component."""
     components = np.array([0.01, 0.1, 0.5, 0.95])
     prior = SpikeAndSlab.build(
         spike=SPIKE, components=tuple(components), spread=SPREAD, dirichlet_strength=3.0, partial=1.0
@@ -94,9 +98,9 @@ def test_a_part_of_an_attachment_is_on_the_nearest_softer_rung():
         np.testing.assert_allclose(prior.border_kernel[:, column], np.bincount(nearest, minlength=4) / 1e6, atol=1e-5)
 
 
-def test_the_shares_before_parting_are_learned_through_it():
-    """Particles as whole attachments on the third rung and a half of parts of such leave: what EM settles on, and what
-    draws are spread around."""
+def test_weights_are_learned_through_the_border_kernel():
+    """Half of the particles have all of an attachment of the third component, half a part of one: where EM converges,
+    and the mean of the draws."""
     prior = SpikeAndSlab.build(
         spike=SPIKE, components=(0.01, 0.03, 0.1, 0.3), spread=0.1, dirichlet_strength=1.0, partial=0.5
     )
