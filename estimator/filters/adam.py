@@ -17,9 +17,10 @@ from jiggle_mj.observation import Declaration
 
 from ..belief.boundary_belief import BoundaryBelief
 from ..physics.mesh import SheetMesh
+from ..physics.simulator import SWEEPS_PER_STEP, simulator
 from ..physics.xpbd import XPBD
 from .evidence import Evidence, Filter, Update, unavailable
-from .shots import SWEEPS, ShotHistory, Shots, predicted, simulator
+from .shots import ShotHistory, Shots, predicted
 
 RATE = 1e-3
 """Adam's learning rate, which is about how far b moves in a step [membrane stiffness]."""
@@ -66,7 +67,7 @@ class AdamShooting(Filter):
 def loss(simulator: XPBD, b: Float[Array, " n"], shots: Shots) -> Float[Array, ""]:
     """The paper's L [m^2]; a sample that fills up M counts nothing."""
     seen = jnp.trace(shots.precision, axis1=2, axis2=3) > 0
-    end = jax.lax.map(lambda shot: predicted(simulator, shot, b, sweeps=SWEEPS), shots)
+    end = jax.lax.map(lambda shot: predicted(simulator, shot, b, sweeps=SWEEPS_PER_STEP), shots)
     squared = jnp.sum(jnp.where(seen, jnp.sum((shots.end - end) ** 2, axis=2), 0))
     return squared / jnp.sum(jnp.any(seen, axis=1)).astype(b.dtype)
 

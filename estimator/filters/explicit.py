@@ -29,9 +29,10 @@ from jiggle_mj.observation import Declaration
 
 from ..belief.boundary_belief import BoundaryBelief, entropy, standard_deviations
 from ..physics.mesh import SheetMesh
+from ..physics.simulator import SWEEPS_PER_STEP, simulator
 from ..physics.xpbd import XPBD
 from .evidence import Evidence, Filter, Update, unavailable
-from .shots import SWEEPS, ShotHistory, Shots, predicted, simulator, slopes
+from .shots import ShotHistory, Shots, predicted, slopes
 
 PRIOR_MEAN = 1e-4
 """The paper's mu_0 [N/m]."""
@@ -60,7 +61,7 @@ class MultipleShooting(Filter):
         self, belief: BoundaryBelief, b: Float[Array, " n"], evidence: Evidence, start: Float[Array, "n 3"]
     ) -> Update:
         """Take one frame and k - 1 earlier ones into the belief; start is not used."""
-        belief, factor, nis = update(self._simulator, belief, b, self._history.add(evidence), sweeps=SWEEPS)
+        belief, factor, nis = update(self._simulator, belief, b, self._history.add(evidence), sweeps=SWEEPS_PER_STEP)
         b = non_negative(belief, b)
         if not (np.isfinite(factor).all() and np.isfinite(nis)):
             self._history.reject()

@@ -12,20 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jiggle_mj.observation import Declaration
-
 from ..physics.environment import Grip
-from ..physics.membrane import EdgeMembrane
-from ..physics.mesh import SheetMesh
-from ..physics.xpbd import XPBD, hinge_springs
+from ..physics.xpbd import XPBD
 from .evidence import Evidence
 
-HINGE = 1 / 30
-"""Stiffness of the springs across hinges [membrane stiffness]."""
 AT_ONCE = 100
 """Columns of the Jacobian that are computed together, which bounds the memory."""
-TIME_STEP, SWEEPS = 0.02, 20
-"""Of f [s], and Gauss-Seidel sweeps."""
 
 
 class Shots(eqx.Module):
@@ -78,13 +70,6 @@ class ShotHistory:
     def forget(self) -> None:
         """Set t_c to now: no later update draws a step from before."""
         self._shots.clear()
-
-
-def simulator(mesh: SheetMesh, declaration: Declaration) -> XPBD:
-    """The paper's f for a sheet: springs on edges and across hinges, no weight and no bed."""
-    k = declaration.membrane_stiffness
-    springs = EdgeMembrane.build(mesh, stiffness=k), hinge_springs(mesh, stiffness=HINGE * k)
-    return XPBD.build(mesh, springs, areal_density=declaration.areal_density, time_step=TIME_STEP)
 
 
 def predicted(simulator: XPBD, shot: Shots, b: Float[Array, " n"], *, sweeps: int) -> Float[Array, "n 3"]:

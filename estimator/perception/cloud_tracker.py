@@ -22,11 +22,11 @@ from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.observation import Declaration, MeasuredPoints
 from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
 
-from ..filters.shots import simulator
-from ..physics.chamfer import Chamfer
 from ..physics.environment import Grip
 from ..physics.mesh import SheetMesh
+from ..physics.simulator import simulator
 from ..physics.xpbd import XPBD
+from .chamfer import Chamfer
 from .point_tracker import FEWEST
 from .track import UNSEEN_VARIANCE, Track
 

@@ -15,7 +15,7 @@ import trimesh
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
-from .mesh import SheetMesh
+from ..physics.mesh import SheetMesh
 
 
 class Chamfer(eqx.Module):

@@ -8,8 +8,8 @@ from scipy.spatial.distance import cdist
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
+from jiggle_mj.estimator.perception.chamfer import Chamfer, nearest
 from jiggle_mj.estimator.perception.cloud_tracker import CloudTracker, lay_mesh, offset, thinned
-from jiggle_mj.estimator.physics.chamfer import Chamfer, nearest
 from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.mesh import SheetMesh
 from jiggle_mj.observation import MeasuredPoints
