@@ -1,6 +1,6 @@
-"""BLAS on one thread: its own threads get in the way of XLA's.
+"""Limit BLAS to one thread, because its own threads compete with XLA's.
 
-On two cores, an update with both takes half as long again; where the cores are shared, many times as long.
+On two cores an update with both takes 1.5 times as long; where the cores are shared, many times as long.
 """
 
 from contextlib import AbstractContextManager
@@ -10,10 +10,11 @@ from threadpoolctl import ThreadpoolController
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """A context in which BLAS uses one thread."""
+    """Return a context in which BLAS uses one thread."""
     return _controller().limit(limits=1, user_api="blas")
 
 
 @cache
 def _controller() -> ThreadpoolController:
+    """Find the loaded BLAS libraries, once."""
     return ThreadpoolController()

@@ -1,4 +1,7 @@
-"""What does not need each other on all usable cores: compiled code and BLAS leave the interpreter to others."""
+"""Apply a function to independent keys on all usable cores, in threads.
+
+Compiled code and BLAS release the interpreter lock, so that threads are enough.
+"""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,17 +12,21 @@ import jax
 from jiggle_mj.worker_processes import usable_cores
 
 T = TypeVar("T")
-A_CORE = 2
-"""How many take turns on a core: of three that are as long, the third need not wait for two cores to be free."""
+THREADS_PER_CORE = 2
+"""Threads that share a core. With one thread a core, the third of three equal jobs would wait on two cores until a
+whole core is free."""
 
 
-def parallel_map(of: Callable[[int], T], keys: Iterable[int]) -> dict[int, T]:
-    """What a function gives for each, in their order."""
-    keys, wide = list(keys), jax.config.read("jax_enable_x64")
+def parallel_map(function: Callable[[int], T], keys: Iterable[int]) -> dict[int, T]:
+    """Return the value of the function for each key, in the order of the keys.
 
-    def one(k: int) -> T:
-        with jax.enable_x64(wide):  # which is said by thread
-            return of(k)
+    Every thread uses the caller's setting of `jax_enable_x64`. An exception of any call is raised here.
+    """
+    keys, x64 = list(keys), jax.config.read("jax_enable_x64")
 
-    with ThreadPoolExecutor(A_CORE * usable_cores()) as pool:
-        return dict(zip(keys, pool.map(one, keys), strict=True))
+    def call(key: int) -> T:
+        with jax.enable_x64(x64):  # a setting of each thread
+            return function(key)
+
+    with ThreadPoolExecutor(THREADS_PER_CORE * usable_cores()) as pool:
+        return dict(zip(keys, pool.map(call, keys), strict=True))

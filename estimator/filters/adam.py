@@ -17,12 +17,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jiggle_mj.options import FilterName
 
 from ..belief.boundary_belief import BoundaryBelief
+from ..physics.simulator import SWEEPS_PER_STEP
 from ..physics.xpbd import XPBD
 from .evidence import Evidence
 from .explicit import ShootingState
 from .filter import GaussianFilter
 from .posterior_summary import Convergence, Update, unavailable
-from .shots import SWEEPS, ShotHistory, Shots, predicted
+from .shots import ShotHistory, Shots, predicted
 
 RATE = 1e-3
 """Adam's learning rate, about the change of b in a step [membrane stiffness]."""
@@ -41,7 +42,7 @@ class AdamShooting(GaussianFilter[AdamState]):
     """Gradient descent for one sheet."""
 
     simulator: XPBD
-    """f; see `shots.simulator`."""
+    """f; see `physics.simulator`."""
     grip_stiffness: float
     """Stiffness of the springs to the tip [N/m]."""
     samples: int
@@ -92,7 +93,7 @@ class AdamShooting(GaussianFilter[AdamState]):
 def loss(simulator: XPBD, b: Float[Array, " n"], shots: Shots) -> Float[Array, ""]:
     """Return the paper's L [m^2]; a sample without weight counts nothing."""
     seen = jnp.trace(shots.precision, axis1=2, axis2=3) > 0
-    end = jax.lax.map(lambda shot: predicted(simulator, shot, b, sweeps=SWEEPS), shots)
+    end = jax.lax.map(lambda shot: predicted(simulator, shot, b, sweeps=SWEEPS_PER_STEP), shots)
     squared = jnp.sum(jnp.where(seen, jnp.sum((shots.end - end) ** 2, axis=2), 0))
     return squared / jnp.sum(jnp.any(seen, axis=1)).astype(b.dtype)
 

@@ -29,11 +29,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jiggle_mj.options import FilterName
 
 from ..belief.boundary_belief import BoundaryBelief, entropy, standard_deviations
+from ..physics.simulator import SWEEPS_PER_STEP
 from ..physics.xpbd import XPBD
 from .evidence import Evidence
 from .filter import FilterState, GaussianFilter
 from .posterior_summary import Convergence, Update, are_finite, unavailable
-from .shots import SWEEPS, ShotHistory, Shots, predicted, slopes
+from .shots import ShotHistory, Shots, predicted, slopes
 
 PRIOR_MEAN = 1e-4
 """The paper's mu_0 [N/m]."""
@@ -50,7 +51,7 @@ class MultipleShooting(GaussianFilter[ShootingState]):
     """The paper's filter for one sheet."""
 
     simulator: XPBD
-    """f; see `shots.simulator`."""
+    """f; see `physics.simulator`."""
     grip_stiffness: float
     """Stiffness of the springs to the tip [N/m]."""
     samples: int
@@ -82,7 +83,7 @@ class MultipleShooting(GaussianFilter[ShootingState]):
         before = state.summary.belief
         assert isinstance(before, BoundaryBelief)
         history, shots = state.history.with_step(evidence, grip_stiffness=self.grip_stiffness).draw(self.samples)
-        belief, factor, nis = update(self.simulator, before, state.summary.b, shots, sweeps=SWEEPS)
+        belief, factor, nis = update(self.simulator, before, state.summary.b, shots, sweeps=SWEEPS_PER_STEP)
         b = non_negative(belief, state.summary.b)
         usable = are_finite(factor, nis)
         if not usable:

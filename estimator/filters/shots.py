@@ -14,22 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jiggle_mj.observation import Declaration
-
 from ..physics.environment import Grip
-from ..physics.membrane import EdgeMembrane
-from ..physics.mesh import SheetMesh
-from ..physics.xpbd import XPBD, hinge_springs
+from ..physics.xpbd import XPBD
 from .evidence import Evidence
 
-HINGE = 1 / 30
-"""Stiffness of the springs across hinges [membrane stiffness]. The paper gives none."""
 JACOBIAN_BATCH = 100
 """Columns of the Jacobian that are computed together, which bounds the memory."""
-TIME_STEP = 0.02
-"""Time step of f [s]. The paper gives none."""
-SWEEPS = 20
-"""Gauss-Seidel sweeps of f in each step. The paper gives none."""
 
 
 class Shots(eqx.Module):
@@ -95,13 +85,6 @@ class ShotHistory(eqx.Module):
     def forgotten(self) -> "ShotHistory":
         """Return the history with t_c set to now: no later update draws a step from before."""
         return replace(self, shots=())
-
-
-def simulator(mesh: SheetMesh, declaration: Declaration) -> XPBD:
-    """Return the paper's f for a sheet: springs on edges and across hinges, no weight and no bed."""
-    k = declaration.membrane_stiffness
-    springs = EdgeMembrane.build(mesh, stiffness=k), hinge_springs(mesh, stiffness=HINGE * k)
-    return XPBD.build(mesh, springs, areal_density=declaration.areal_density, time_step=TIME_STEP)
 
 
 def predicted(simulator: XPBD, shot: Shots, b: Float[Array, " n"], *, sweeps: int) -> Float[Array, "n 3"]:

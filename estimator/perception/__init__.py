@@ -1,10 +1,11 @@
-"""From stereo images, tracked points or clouds to particles.
+"""Perception: measurements of the particles from stereo images, tracked points or clouds.
 
-Of images: tissue mask, disparity, the estimator's own mesh, and tracks of its particles. Data flow: `rectified` ->
-`tissue_mask`, `disparity` -> `sheet_mesh` -> (`material_map`, `mesh_field`) -> `flow` -> `registration` (with
-`lucas_kanade`) -> `stereo_tracker`, which holds it together. `sight` is the door to all three.
+`perception` selects the tracker of a recording: `stereo_tracker`, `point_tracker` or `cloud_tracker`. Data flow of
+images: `rectified` -> `tissue_mask`, `disparity` -> `sheet_mesh` -> (`material_map`, `mesh_field`) -> `flow` ->
+`registration` (with `lucas_kanade`), in the order of `stereo_tracker`. `config` holds the settings.
 """
 
+from .config import PerceptionConfig
 from .disparity import Disparity, SemiGlobalMatching
 from .perception import Believed, Perception
 from .point_tracker import PointTracker
@@ -16,6 +17,7 @@ __all__ = [
     "Believed",
     "Disparity",
     "Perception",
+    "PerceptionConfig",
     "PointTracker",
     "SemiGlobalMatching",
     "StereoTracker",

@@ -1,11 +1,11 @@
-"""From clouds whose points have no identities to particles: the paper's joint estimation of state and attachments.
+"""Tracker of clouds whose points have no identities: the paper's joint estimation of state and attachments.
 
-A mesh is laid over the clouds of the sheet at rest. Each later cloud is met by one step of the simulator f', in whose
-sweeps the gradient of the chamfer distance takes part (`xpbd`, `chamfer`), with the attachments believed so far: the
-state of a frame depends on the belief, and the belief on the states. A particle's observation is then the mean of the
-points around it, along the sheet's normal. A cloud shows where the surface is, and not which point of it: along it the
-particles are where the simulator takes them, and are stated to be known no better than to `SLIDE`. Where the sheet
-slides within its own surface, nothing is seen.
+A mesh is laid over the clouds of the sheet at rest. Each later cloud is matched by one step of the simulator f', whose
+sweeps include the gradient of the chamfer distance (`xpbd`, `chamfer`) and whose attachments are the belief's: the
+state of a frame depends on the belief, and the belief on the states. The observation of a particle is then the mean of
+the points around it, along the sheet's normal. A cloud shows where the surface is, and not which point of it. Along the
+surface the particles are where the simulator moves them, with a standard deviation of `CloudTrackerConfig.slide_sd`. A
+cloud does not show that the sheet slides within its own surface.
 """
 
 import equinox as eqx
@@ -22,59 +22,51 @@ from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.observation import Declaration, MeasuredPoints
 from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
 
-from ..filters.shots import simulator
-from ..physics.chamfer import Chamfer
 from ..physics.environment import Grip
 from ..physics.mesh import SheetMesh
+from ..physics.simulator import simulator
 from ..physics.xpbd import XPBD
-from .point_tracker import FEWEST
+from .chamfer import Chamfer
+from .config import CloudTrackerConfig
 from .track import UNSEEN_VARIANCE, Track
 
-LONGEST_EDGE = 2.5
-"""Triangles with a longer edge are no tissue [spacing]."""
-THINNED = 0.75
-"""Least distance of two particles, which are then about one apart [spacing]."""
-AROUND = 0.7
-"""Points of the clouds at rest within this distance give a particle its height [spacing]."""
-SAMPLES = 3000
-"""Points on the mesh; of a larger cloud so many are used."""
-REACH = 0.15
-"""See `Chamfer` [spacing]. From about 0.3 on, an edge of the view draws in what is hidden behind it."""
-SWEEPS = 120
-"""Of the step that meets a cloud. The paper's 20 leave a lifted corner behind the cloud, and what is behind is taken to
-be held back."""
-RATE = 0.6
-"""Share of the way to a cloud that an even shift of it moves the sheet in one sweep: the paper's alpha, made free of
-the number of points."""
-SLIDE = 5e-3
-"""Standard deviation of a particle's place along the surface [m]."""
 
+def lay_mesh(still: list[MeasuredPoints], *, spacing: float, config: CloudTrackerConfig | None = None) -> Sheet:
+    """Return a mesh over clouds of the sheet at rest.
 
-def lay_mesh(still: list[MeasuredPoints], *, spacing: float) -> Sheet:
-    """A mesh over clouds of the sheet at rest: points of the largest, thinned from the outline on, at all their height.
+    Its particles are points of the largest cloud, thinned from the outline inwards, at the mean height of all clouds'
+    points around them.
+
+    Args:
+        still: clouds of the sheet at rest.
+        spacing: distance between neighbouring particles [m].
+        config: settings of the mesh; the defaults if None.
 
     Raises:
-        PerceptionError: too small a sheet for the spacing.
-        MeshError: two sheets.
+        PerceptionError: the sheet is too small for the spacing.
+        MeshError: the points show two sheets.
     """
-    clouds = [one.positions[np.isfinite(one.positions).all(axis=1)] for one in still]
+    config = config or CloudTrackerConfig()
+    clouds = [points.positions[np.isfinite(points.positions).all(axis=1)] for points in still]
     largest = max(clouds, key=len)
-    if len(largest) < FEWEST:
-        raise PerceptionError(f"the clouds at rest have {len(largest)} points at most; a sheet needs {FEWEST}.")
+    if len(largest) < config.min_points:
+        raise PerceptionError(
+            f"the clouds at rest have {len(largest)} points at most; a sheet needs {config.min_points}."
+        )
     plane = SheetPlane.through(np.concatenate(clouds))
     flat = plane.flatten(largest)
     flat = np.concatenate([flat[on_outline := outline(flat, spacing)], flat[~on_outline]])
-    chosen = flat[thinned(flat, THINNED * spacing)]
-    if len(chosen) < FEWEST:
+    chosen = flat[thinned(flat, config.min_gap * spacing)]
+    if len(chosen) < config.min_points:
         raise PerceptionError(
             f"the clouds at rest give {len(chosen)} particles at a spacing of {spacing * 1e3:.1f} mm; a sheet needs "
-            f"{FEWEST} (more points, or a smaller EstimatorConfig.spacing)."
+            f"{config.min_points} (record more points, or choose a smaller EstimatorConfig.spacing)."
         )
-    faces = triangulate(chosen, LONGEST_EDGE * spacing)
+    faces = triangulate(chosen, config.max_edge * spacing)
     used, faces = np.unique(faces, return_inverse=True)
-    everything = np.concatenate(clouds)
-    around = KDTree(plane.flatten(everything)).query_ball_point(chosen[used], AROUND * spacing)
-    above = (everything - plane.centre) @ plane.axes[2]
+    points = np.concatenate(clouds)
+    around = KDTree(plane.flatten(points)).query_ball_point(chosen[used], config.neighbourhood * spacing)
+    above = (points - plane.centre) @ plane.axes[2]
     height = np.array([above[near].mean() for near in around])
     rest = plane.raise_up(chosen[used]) + height[:, None] * plane.axes[2]
     check_mesh(rest, faces.reshape(-1, 3))
@@ -82,16 +74,16 @@ def lay_mesh(still: list[MeasuredPoints], *, spacing: float) -> Sheet:
 
 
 def outline(flat: Float[np.ndarray, "m 2"], spacing: float) -> Bool[np.ndarray, " m"]:
-    """Which points the sheet ends with; gaps up to the spacing are no end."""
+    """Return which points lie on the outline of the sheet; gaps up to the spacing [m] are no outline."""
     edges = np.sort(triangulate(flat, spacing)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     pairs, count = np.unique(edges, axis=0, return_counts=True)
-    found = np.zeros(len(flat), bool)
-    found[pairs[count == 1]] = True
-    return found
+    on_outline = np.zeros(len(flat), bool)
+    on_outline[pairs[count == 1]] = True
+    return on_outline
 
 
 def thinned(flat: Float[np.ndarray, "m 2"], spacing: float) -> list[int]:
-    """Points of which no two are nearer than the spacing, taken in order."""
+    """Return the indices of points of which no two are nearer than the spacing [m], chosen in order."""
     near = KDTree(flat).query_ball_point(flat, spacing)
     free, chosen = np.ones(len(flat), bool), []
     for i, around in enumerate(near):
@@ -102,31 +94,39 @@ def thinned(flat: Float[np.ndarray, "m 2"], spacing: float) -> list[int]:
 
 
 class CloudTracker:
-    """Follows one sheet through a recording of clouds."""
+    """Tracker of one sheet in a recording of clouds."""
 
-    def __init__(self, sheet: Sheet, declaration: Declaration):
-        mesh = SheetMesh(sheet.rest, sheet.faces)
+    def __init__(self, sheet: Sheet, declaration: Declaration, config: CloudTrackerConfig | None = None):
+        mesh, self._config = SheetMesh(sheet.rest, sheet.faces), config or CloudTrackerConfig()
         self._simulator = simulator(mesh, declaration)
-        self._chamfer = Chamfer.build(mesh, count=SAMPLES, reach=REACH * mesh.spacing)
-        self._faces, self._around = sheet.faces, AROUND * mesh.spacing
+        self._chamfer = Chamfer.build(mesh, count=self._config.samples, reach=self._config.reach * mesh.spacing)
+        self._faces, self._neighbourhood = sheet.faces, self._config.neighbourhood * mesh.spacing
 
     def track(
         self, points: MeasuredPoints, before: Float[np.ndarray, "n 3"], b: Float[np.ndarray, " n"], grip: Grip
     ) -> Track:
-        """Meet one cloud from the state before it, the tip having moved, with attachments b [N/m]."""
+        """Return the particles that match one cloud.
+
+        Args:
+            points: the cloud.
+            before: state of the frame before [m].
+            b: stiffness of the attachments [N/m].
+            grip: springs to the tip, which has moved since.
+        """
+        samples = self._config.samples
         cloud = points.positions[np.isfinite(points.positions).all(axis=1)]
         if not len(cloud):
             return Track.of_nothing(len(before))
-        cloud = cloud[np.linspace(0, len(cloud), min(len(cloud), SAMPLES), endpoint=False).astype(int)]
-        filled = np.full((SAMPLES, 3), np.nan)
-        filled[: len(cloud)] = cloud
-        state = jnp.asarray(before), jnp.asarray(b), grip, jnp.asarray(filled)
-        x = np.asarray(_met(self._simulator, self._chamfer, *state))
+        cloud = cloud[np.linspace(0, len(cloud), min(len(cloud), samples), endpoint=False).astype(int)]
+        padded = np.full((samples, 3), np.nan)
+        padded[: len(cloud)] = cloud
+        state = jnp.asarray(before), jnp.asarray(b), grip, jnp.asarray(padded)
+        x = np.asarray(_matched(self._simulator, self._chamfer, *state, self._config))
         normal = trimesh.Trimesh(x, self._faces, process=False).vertex_normals
-        off = offset(x, normal, cloud, self._around)
-        x, seen = x + normal * off[:, None], np.isfinite(off)
+        height = offset(x, normal, cloud, self._neighbourhood)
+        x, seen = x + normal * height[:, None], np.isfinite(height)
         across = normal[:, :, None] * normal[:, None, :]
-        covariance = points.sd**2 * across + SLIDE**2 * (np.eye(3) - across)
+        covariance = points.sd**2 * across + self._config.slide_sd**2 * (np.eye(3) - across)
         unseen = UNSEEN_VARIANCE * np.eye(3)
         return Track(
             positions=np.where(seen[:, None], x, np.nan),
@@ -138,9 +138,10 @@ class CloudTracker:
 def offset(
     x: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], cloud: Float[np.ndarray, "q 3"], around: float
 ) -> Float[np.ndarray, " n"]:
-    """How far along its normal each particle is from the mean of the points around it, NaN where there are none [m].
+    """Return the mean height of the points around each particle, along its normal [m]; NaN where there are none.
 
-    What the simulator's forces and the cloud's pull left between them, which a filter would take for forces.
+    The simulator stops where its elastic forces balance the attraction of the cloud. Without this correction a filter
+    would take the distance for the effect of attachment forces.
     """
     near = KDTree(cloud).query_ball_point(x, around)
     count = np.array([len(points) for points in near])
@@ -151,15 +152,17 @@ def offset(
 
 
 @eqx.filter_jit
-def _met(
+def _matched(
     simulator: XPBD,
     chamfer: Chamfer,
     x: Float[Array, "n 3"],
     b: Float[Array, " n"],
     grip: Grip,
     cloud: Float[Array, "q 3"],
-):
+    config: CloudTrackerConfig,
+) -> Float[Array, "n 3"]:
+    """Return the state that matches a cloud, padded with NaN, after one step of f' [m]."""
     count = jnp.sum(jnp.where(jnp.isfinite(cloud[:, 0]), 1.0, 0.0)) + len(chamfer.corners)
-    rate = RATE * len(x) / (2 * count)
-    slope = jax.grad(chamfer.distance)
-    return simulator.step(x, b, grip, sweeps=SWEEPS, residual=lambda y: -rate * slope(y, cloud))
+    rate = config.rate * len(x) / (2 * count)
+    gradient = jax.grad(chamfer.distance)
+    return simulator.step(x, b, grip, sweeps=config.sweeps, residual=lambda y: -rate * gradient(y, cloud))

@@ -1,8 +1,10 @@
-"""Between particles and pixels: piecewise linear fields over the mesh as drawn in the first image.
+"""Map between particles and pixels: piecewise linear fields over the mesh in the first image.
 
-A material point is named by its pixel in the first left image. Values at the particles spread over the triangles by
-barycentric coordinates; the rim's triangles are continued a few pixels outwards, to the edge of the tissue.
+The coordinates of a material point are its pixel in the first left image. Barycentric coordinates interpolate values at
+the particles over the triangles. The outermost triangles continue a few pixels outwards, to the edge of the tissue.
 """
+
+import math
 
 import cv2
 import numpy as np
@@ -10,12 +12,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_array
 
-RIM = 2
-"""Pixels at the tissue's edge that are left out: they blend with what lies behind [px]."""
-REACH = 8.0
-"""How far triangles are continued beyond the rim [px]."""
-MARGIN = 14
-"""Empty border around the region of interest [px]."""
+from .config import RegistrationConfig
+
+MARGIN = 6
+"""Width of the empty border of the region of interest, beyond the continued triangles [px]."""
+SUBPIXEL_BITS = 4
+"""Fractional bits of the corners of triangles that OpenCV draws: 1/16 px."""
 
 
 class MaterialMap:
@@ -26,6 +28,7 @@ class MaterialMap:
         uv: Float[np.ndarray, "n 2"],
         faces: Int[np.ndarray, "f 3"],
         tissue: Bool[np.ndarray, "height width"],
+        config: RegistrationConfig | None = None,
     ):
         """Rasterise the mesh.
 
@@ -33,35 +36,40 @@ class MaterialMap:
             uv: particles in the first left image [px].
             faces: triangles.
             tissue: tissue pixels of the first left image.
+            config: width of the rim and of the continuation; the defaults if None.
         """
+        config = config or RegistrationConfig()
         height, width = tissue.shape
-        low = np.maximum(np.floor(uv.min(axis=0)).astype(int) - MARGIN, 0)
-        high = np.minimum(np.ceil(uv.max(axis=0)).astype(int) + MARGIN + 1, (width, height))
+        margin = MARGIN + math.ceil(config.max_continuation)
+        low = np.maximum(np.floor(uv.min(axis=0)).astype(int) - margin, 0)
+        high = np.minimum(np.ceil(uv.max(axis=0)).astype(int) + margin + 1, (width, height))
         self.region = (slice(low[1], high[1]), slice(low[0], high[0]))
         """Rows and columns of the region of interest."""
         self.shape = (int(high[1] - low[1]), int(high[0] - low[0]))
+        """Height and width of the region of interest [px]."""
         self.at = uv - low
-        """Particles in the region's pixels."""
+        """Particles in pixels of the region of interest."""
         owner = np.zeros(self.shape, np.int32)
         for face, corners in enumerate(self.at[faces], start=1):
-            cv2.fillConvexPoly(owner, np.round(corners * 16).astype(np.int32), face, shift=4)
+            cv2.fillConvexPoly(owner, np.round(corners * 2**SUBPIXEL_BITS).astype(np.int32), face, shift=SUBPIXEL_BITS)
         distance = np.empty(self.shape)
         nearest = np.empty((2, *self.shape), np.int32)
         distance_transform_edt(owner == 0, return_indices=True, distances=distance, indices=nearest)
         owner = owner[nearest[0], nearest[1]] - 1
-        whole = cv2.erode(np.pad(tissue, 1).astype(np.uint8), np.ones((3, 3), np.uint8), iterations=RIM)[1:-1, 1:-1]
-        self.support = whole.astype(bool)[self.region] & (distance < REACH)
-        """Pixels whose material point the mesh knows."""
+        framed = np.pad(tissue, 1).astype(np.uint8)
+        inner = cv2.erode(framed, np.ones((3, 3), np.uint8), iterations=config.rim)[1:-1, 1:-1]
+        self.support = inner.astype(bool)[self.region] & (distance < config.max_continuation)
+        """Pixels that have a material point on the mesh."""
         self._barycentric = _barycentric(self.at, faces, owner, self.support, len(uv))
 
     def spread(self, values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "h w k"]:
-        """Values at the particles as dense float32 fields; outside the support they are -1."""
+        """Return values at the particles as dense float32 fields, which are -1 outside the support."""
         dense = np.full((*self.shape, values.shape[1]), -1, np.float32)
         dense[self.support] = self._barycentric @ values.astype(np.float32)
         return dense
 
     def sample(self, image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, " n"]:
-        """A dense field at the particles, bilinear."""
+        """Return a dense field at the particles, by bilinear interpolation."""
         x, y = self.at.astype(np.float32).T
         return cv2.remap(image, x[None], y[None], cv2.INTER_LINEAR)[0]
 
@@ -73,7 +81,7 @@ def _barycentric(
     support: Bool[np.ndarray, "h w"],
     n: int,
 ) -> csr_array:
-    """Sparse matrix (pixels of the support, particles) of barycentric coordinates, unbounded outside a triangle."""
+    """Return the matrix of barycentric coordinates (pixels of the support, particles), unbounded outside a triangle."""
     rows, columns = np.nonzero(support)
     corner = at[faces]
     face = owner[rows, columns]

@@ -1,7 +1,7 @@
-"""Smooth fields over the mesh: filling in what was not measured, and local derivatives.
+"""Smooth fields over the mesh: interpolation of unmeasured values, and local derivatives.
 
-The fill minimises sum_i c_i |f_i - m_i|^2 + stiffness |L f|^2 with the umbrella Laplacian L: it continues measured
-values linearly, and follows them where they are trusted. Knows nothing of images or mechanics.
+The fill minimises sum_i c_i |f_i - m_i|^2 + stiffness |L f|^2 with the umbrella Laplacian L and confidences c_i: it
+follows confident measurements and continues them linearly. It is independent of images and mechanics.
 """
 
 import numpy as np
@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-LEAST_CONFIDENCE = 1e-6
-"""Keeps the fill solvable where nothing was measured at all: it then tends to 0."""
+MIN_CONFIDENCE = 1e-6
+"""Confidence that is added everywhere, so that the fill has a solution where nothing was measured; it then tends to
+0."""
 
 
 class MeshField:
@@ -38,23 +39,29 @@ class MeshField:
         *,
         stiffness: float = 0.1,
     ) -> Float[np.ndarray, "n k"]:
-        """The smooth field that follows `measured` where `confidence` is above 0; NaN there is not allowed."""
-        trust = np.asarray(confidence, float) + LEAST_CONFIDENCE
+        """Return the smooth field that follows `measured` where `confidence` is above 0; NaN there is not allowed.
+
+        `stiffness` weighs smoothness against a measurement of confidence 1.
+        """
+        trust = np.asarray(confidence, float) + MIN_CONFIDENCE
         target = np.where(np.asarray(confidence, bool)[:, None], measured, 0.0)
         system = csc_array(diags_array(trust) + stiffness * self._roughness)
         factor = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         return factor.solve(np.asarray(confidence, float)[:, None] * target)
 
     def widened(self, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """The chosen particles and those that share an edge with one."""
+        """Return the chosen particles and those that share an edge with one."""
         return chosen | ((self._neighbours >= 0) & chosen[self._neighbours]).any(axis=1)
 
     def stray(self, values: Float[np.ndarray, "n k"], known: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Distance of each value from the median of its known neighbours; inf where it or all of them are unknown."""
+        """Return each value's distance from its known neighbours' median; inf where it or all of them are unknown."""
         return self._from_median(values, values[self._neighbours], known)
 
     def off_trend(self, values: Float[np.ndarray, "n 2"], known: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """The same, with each neighbour's value continued to the particle by the neighbour's own derivative."""
+        """Return each value's distance from the median of its neighbours' linear continuations; inf as in `stray`.
+
+        A neighbour's value is continued to the particle by the neighbour's own derivative.
+        """
         step = self._uv[:, None, :] - self._uv[self._neighbours]
         continued = values[self._neighbours] + np.einsum("nmij,nmj->nmi", self.jacobian(values)[self._neighbours], step)
         return self._from_median(values, continued, known)
@@ -62,23 +69,24 @@ class MeshField:
     def _from_median(
         self, values: Float[np.ndarray, "n k"], around: Float[np.ndarray, "n m k"], known: Bool[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
+        """Return the distance of each value from the median of the known values `around` it."""
         usable = (self._neighbours >= 0) & known[self._neighbours]
         count = usable.sum(axis=1)
         ordered = np.sort(np.where(usable[..., None], around, np.inf), axis=1)
         rows = np.arange(len(values))
-        middle = (
+        median = (
             ordered[rows, np.maximum(count - 1, 0) // 2] + ordered[rows, np.minimum(count // 2, ordered.shape[1] - 1)]
         ) / 2
-        sure = known & (count > 0)
-        return np.where(sure, np.linalg.norm(values - np.where(sure[:, None], middle, 0), axis=1), np.inf)
+        comparable = known & (count > 0)
+        return np.where(comparable, np.linalg.norm(values - np.where(comparable[:, None], median, 0), axis=1), np.inf)
 
     def jacobian(self, values: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
-        """Derivative of values by first-image pixels, by least squares over each particle's neighbours."""
+        """Return the derivative of values by first-image pixels, by least squares over each particle's neighbours."""
         return np.stack([gradient @ values for gradient in self._gradient], axis=-1)
 
 
 def _gradient(uv: Float[np.ndarray, "n 2"], i: np.ndarray, j: np.ndarray) -> tuple[csr_array, csr_array]:
-    """Two sparse matrices that turn values at the particles into their derivatives by u and v.
+    """Return two sparse matrices that map values at the particles to their derivatives by u and v.
 
     Least squares over the neighbours j of i: g_i = (sum_j s s^T)^-1 sum_j s (f_j - f_i), s = uv_j - uv_i.
     """

@@ -1,6 +1,6 @@
-"""What sees the sheet, whichever a recording has: stereo images, tracked points, or clouds without identities.
+"""Perception of one sheet from whatever a recording has: stereo images, tracked points, or clouds without identities.
 
-Finds the sheet at rest in the frames before the first grasp, and its particles in every frame after that.
+It finds the sheet at rest in the frames before the first grasp, and its particles in every later frame.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, Ster
 
 from ..physics.environment import Grip
 from .cloud_tracker import CloudTracker, lay_mesh
+from .config import PerceptionConfig
 from .disparity import Disparity
 from .point_tracker import PointTracker
 from .stereo_tracker import StereoTracker
@@ -22,11 +23,11 @@ from .tissue_mask import TissueMask
 from .track import Track
 
 Believed = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Grip]
-"""What meets a cloud: the positions before, b, and the tip's move."""
+"""Arguments of the simulator that matches a cloud: the positions before [m], b [N/m], and the grip after the move."""
 
 
 class Perception:
-    """Sees one sheet."""
+    """Perception of one sheet."""
 
     def __init__(
         self,
@@ -36,13 +37,25 @@ class Perception:
         spacing: float,
         mask: TissueMask | None,
         disparity: Disparity | None,
+        config: PerceptionConfig | None = None,
     ) -> None:
-        """Say what is known beforehand; see `Estimator`. `spacing` is that of a mesh laid over what is seen [m]."""
-        self._declaration, self._spacing = declaration, spacing
+        """Choose the trackers; see `Estimator` for the arguments.
+
+        Args:
+            declaration: what the user says of the tissue.
+            camera: needed for observations with images.
+            spacing: distance between the particles of a mesh laid over images or clouds [m].
+            mask: segmentation of tissue; by colour if None.
+            disparity: dense stereo; semi-global matching if None.
+            config: settings of the trackers; the defaults if None.
+        """
+        self._declaration, self._spacing, self._config = declaration, spacing, config or PerceptionConfig()
         self._stereo = (
-            None if camera is None else StereoTracker(camera, spacing=spacing, mask=mask, disparity=disparity)
+            None
+            if camera is None
+            else StereoTracker(camera, spacing=spacing, mask=mask, disparity=disparity, config=self._config.stereo)
         )
-        self._points = PointTracker(declaration.mesh)
+        self._points = PointTracker(declaration.mesh, self._config.points)
         self._clouds: CloudTracker | None = None
         self._still: list[MeasuredPoints] = []
         self._still_times: list[int] = []
@@ -50,32 +63,34 @@ class Perception:
 
     @property
     def ready(self) -> bool:
-        """Whether a frame has shown the sheet."""
+        """Return whether a frame has shown the sheet."""
         return self._sheet is not None or bool(self._still)
 
     @property
     def identifies(self) -> bool:
-        """Whether what is seen says which particle is where."""
+        """Return whether measurements identify the particles; clouds do not."""
         return self._clouds is None
 
     @property
     def track_ids(self) -> Int[np.ndarray, " n"] | None:
-        """Which tracked point each particle is; None where they have no names."""
+        """Return the track id of each particle; None if points have no identities."""
         return self._points.ids if len(self._points.ids) else None
 
     def look_at_rest(self, observation: Observation) -> str | None:
-        """Use a frame before the first grasp: the first image, every frame of points; or say why it is passed over.
+        """Use a frame before the first grasp, and return None, or why it is skipped.
+
+        Of images the first usable pair is used, of points every frame.
 
         Raises:
-            PerceptionError: it shows nothing, or shows no sheet and the jaws are closed.
+            PerceptionError: the frame has no measurement, or shows no sheet while the jaws are closed.
         """
         if observation.images is not None and self._stereo is not None:
             if self._sheet is not None:
                 return None
-            passed_over = self._lay_over(observation.images, observation.tool)
-            if passed_over is None:
+            reason = self._start_stereo(observation.images, observation.tool)
+            if reason is None:
                 self._still_times = [observation.time]
-            return passed_over
+            return reason
         points = _points(observation)
         if not (observation.tool.closed and self._still):
             self._still.append(points)
@@ -84,19 +99,19 @@ class Perception:
 
     @property
     def rest_time(self) -> int:
-        """When the sheet lay as `sheet` has it [ns]: in the mean of the frames that it is the mean of, or the first.
+        """Return the time of the rest shape [ns]: the mean over the frames that it is the mean of.
 
-        A declared mesh is taken to be that of the first frame.
+        The time of a declared mesh is that of the first frame.
         """
         times = self._still_times
         return times[0] if self._declaration.mesh is not None else sum(times) // len(times)
 
     def sheet(self) -> Sheet:
-        """The sheet at rest by the frames so far, fixed from then on.
+        """Return the sheet at rest from the frames so far; from then on it is fixed.
 
         Raises:
-            PerceptionError: the points show none.
-            MeshError: they show two.
+            PerceptionError: the points show no sheet.
+            MeshError: the points show two sheets.
         """
         if self._sheet is None:
             self._sheet = self._sheet_of_points()
@@ -105,23 +120,23 @@ class Perception:
     def track(
         self, observation: Observation, *, predicted: Float[np.ndarray, "n 3"], believed: Callable[[], Believed]
     ) -> Track:
-        """The particles in one frame.
+        """Return the measurement of the particles in one frame.
 
         Args:
             observation: the frame.
-            predicted: where they may be [m].
-            believed: asked where a cloud has to be met.
+            predicted: predicted positions of the particles [m].
+            believed: returns the arguments of the simulator; called for clouds alone.
 
         Raises:
-            PerceptionError: it shows nothing that can be used.
+            PerceptionError: the frame has no usable measurement.
         """
         if observation.images is not None and self._stereo is not None:
             return self._stereo.track(observation.images, observation.tool, predicted=predicted)
         points = _points(observation)
         return self._points.track(points) if self._clouds is None else self._clouds.track(points, *believed())
 
-    def _lay_over(self, images: StereoPair, tool: ToolState) -> str | None:
-        """Lay the mesh over an image; one that cannot be used is passed over while another may come."""
+    def _start_stereo(self, images: StereoPair, tool: ToolState) -> str | None:
+        """Lay the mesh over a pair, and return None, or why it is skipped; with closed jaws no other pair will come."""
         assert self._stereo is not None
         try:
             self._sheet = self._stereo.start(images, tool)
@@ -132,19 +147,21 @@ class Perception:
         return None
 
     def _sheet_of_points(self) -> Sheet:
+        """Return the sheet at rest of points or clouds, and choose their tracker."""
         if all(points.track_id is not None for points in self._still):
             return self._points.start(self._still)
         declared = self._declaration.mesh
         sheet = (
-            lay_mesh(self._still, spacing=self._spacing)
+            lay_mesh(self._still, spacing=self._spacing, config=self._config.clouds)
             if declared is None
             else Sheet(rest=declared.vertices, faces=declared.faces)
         )
-        self._clouds = CloudTracker(sheet, self._declaration)
+        self._clouds = CloudTracker(sheet, self._declaration, self._config.clouds)
         return sheet
 
 
 def _points(observation: Observation) -> MeasuredPoints:
+    """Return the points of an observation that must have them."""
     if observation.points is None:
         raise PerceptionError(
             f"observation {observation.index} has neither points nor images with a calibrated camera; one is needed."

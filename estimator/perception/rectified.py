@@ -1,11 +1,11 @@
-"""From a raw stereo pair to what perception works on: two rectified colour images and their grey versions.
+"""Rectification of a raw stereo pair: two rectified colour images and their grey versions.
 
-Rectification with OpenCV's `initUndistortRectifyMap` from the calibration's K, D, R, P; a calibration that already is
-rectified costs nothing. Does not calibrate, and does not correct brightness between the cameras: the matching
-normalises locally.
+It uses OpenCV's `initUndistortRectifyMap` with the calibration's K, D, R, P; a pair that is rectified already is not
+resampled. It does not calibrate, and does not equalise brightness between the cameras: the matching normalises locally.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,13 +15,13 @@ from jiggle_mj.camera import CameraCalibration, StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.observation import StereoPair
 
+from .config import StereoTrackerConfig
 from .resampling import double
 
-DARK = 8.0
-"""An image is black when even its 99th percentile stays below this grey value of 255 (sensor noise is 1 to 3)."""
-
-SMOOTHING = 0.6
-"""Standard deviation of the Gaussian on the grey images [px]: quiets noise and aliasing."""
+BLACK_STRIDE = 4
+"""Every fourth pixel in either direction is enough to tell a black image."""
+BLACK_PERCENTILE = 99
+"""Percentile of the grey values that is compared, so that single hot pixels do not count."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,36 +29,31 @@ class RectifiedPair:
     """One rectified stereo pair."""
 
     left: UInt8[np.ndarray, "height width 3"]
-    """RGB."""
+    """Rectified left image, RGB."""
     right: UInt8[np.ndarray, "height width 3"]
-    """RGB."""
+    """Rectified right image, RGB."""
     left_grey: Float[np.ndarray, "height width"]
-    """0 to 255, float32, lightly smoothed."""
+    """Smoothed left grey image, 0 to 255, float32."""
     right_grey: Float[np.ndarray, "height width"]
-    """0 to 255, float32, lightly smoothed."""
+    """Smoothed right grey image, 0 to 255, float32."""
     left_fine: Float[np.ndarray, "doubled_height doubled_width"]
     """The left grey image at half-pixel spacing."""
     right_fine: Float[np.ndarray, "doubled_height doubled_width"]
     """The right grey image at half-pixel spacing."""
-
-    @property
-    def black_side(self) -> str | None:
-        """Which image is black: 'left', 'right' or None."""
-        for side, grey in (("left", self.left_grey), ("right", self.right_grey)):
-            if np.percentile(grey[::4, ::4], 99) < DARK:
-                return side
-        return None
+    black_side: Literal["left", "right"] | None
+    """Which image is black."""
 
 
 class Rectifier:
-    """Rectifies the pairs of one camera; the maps are computed once."""
+    """Rectifier of the pairs of one camera; its maps are computed once."""
 
-    def __init__(self, camera: StereoCamera):
+    def __init__(self, camera: StereoCamera, config: StereoTrackerConfig | None = None):
+        self._config = config or StereoTrackerConfig()
         self._size = (camera.left.height, camera.left.width)
         self._maps = [rectifying_maps(calibration) for calibration in (camera.left, camera.right)]
 
     def __call__(self, images: StereoPair) -> RectifiedPair:
-        """Rectify one pair.
+        """Return one pair, rectified.
 
         Raises:
             PerceptionError: the images are not of the calibrated size.
@@ -67,14 +62,16 @@ class Rectifier:
             given = f"{images.left.shape[1]}x{images.left.shape[0]}"
             raise PerceptionError(
                 f"the images are {given} px and the calibration is for {self._size[1]}x{self._size[0]} px; "
-                "record both at one size."
+                "record and calibrate at one size."
             )
         left, right = (
             image if maps is None else cv2.remap(image, *maps, cv2.INTER_LINEAR)
             for image, maps in zip((images.left, images.right), self._maps, strict=True)
         )
         grey = [
-            cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), SMOOTHING)
+            cv2.GaussianBlur(
+                cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), self._config.grey_smoothing
+            )
             for image in (left, right)
         ]
         return RectifiedPair(
@@ -84,11 +81,17 @@ class Rectifier:
             right_grey=grey[1],
             left_fine=double(grey[0]),
             right_fine=double(grey[1]),
+            black_side="left" if self._is_black(grey[0]) else "right" if self._is_black(grey[1]) else None,
         )
+
+    def _is_black(self, grey: Float[np.ndarray, "height width"]) -> bool:
+        """Return whether an image shows nothing but sensor noise."""
+        sampled = grey[::BLACK_STRIDE, ::BLACK_STRIDE]
+        return bool(np.percentile(sampled, BLACK_PERCENTILE) < self._config.min_brightness)
 
 
 def rectifying_maps(calibration: CameraCalibration) -> tuple[np.ndarray, np.ndarray] | None:
-    """Where each rectified pixel comes from in the raw image, for `cv2.remap`; None when nothing moves."""
+    """Return the raw position of each rectified pixel [px], for `cv2.remap`; None if the image is rectified already."""
     if calibration.rectified:
         return None
     c = calibration

@@ -2,7 +2,7 @@
 
 Contour samples of the tissue mask, kept a little inside it so that their surroundings are tissue, plus a hexagonal
 lattice, triangulated after Delaunay in the plane that fits the sheet best. Depth comes from a robust low-order
-polynomial surface through the disparity, so a sheet must be smooth at rest. Knows nothing of the reference's mesh.
+polynomial surface through the disparity, so a sheet must be smooth at rest. The reference's mesh is not used.
 """
 
 from dataclasses import dataclass
@@ -17,38 +17,43 @@ from scipy.spatial import Delaunay
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 
-from .tissue_mask import SECOND_BLOB
+from .config import SheetMeshConfig
+from .tissue_mask import MAX_SECOND_BLOB
 
-FEWEST_PARTICLES = 30
-"""Below this a sheet is too coarse to say anything about where it is attached."""
-SMALLEST_ANGLE = 18.0
-"""Triangles on the rim with a smaller angle are needles and are left out [degrees]."""
-INSET = 0.3
-"""How far inside the contour the outermost particles lie [spacings]."""
-LEAST_MATCHED = 0.2
-"""Share of the tissue's pixels that must have a disparity."""
-MOST_SAMPLES = 20000
-"""Pixels that a surface is fitted to."""
-FINEST_DISPARITY = 0.01
-"""No disparity is known better than this [px]."""
-CAUCHY = 2.0
-"""Residual, in standard deviations, at which a sample counts half."""
+MAX_SURFACE_SAMPLES = 20000
+"""Most pixels that a surface is fitted to, which bounds the time."""
+MAX_PLANE_SAMPLES = 4000
+"""Most points that the sheet's plane is fitted to, which bounds the time."""
+MIN_DISPARITY_SD = 0.01
+"""Lower bound of the standard deviation of disparity [px]: no disparity is known better."""
+MAD_TO_SD = 1.4826
+"""Standard deviation of a normal distribution [median absolute deviation]."""
+CAUCHY_SCALE = 2.0
+"""Residual at which a sample has half its weight [standard deviations]."""
 REWEIGHTINGS = 10
-"""Rounds of reweighting; the weights are steady to 1 % after about six."""
-HIGHEST_DEGREE = 4
-"""Highest degree of the polynomial through the disparity. A plane's disparity is of degree 1."""
+"""Iterations of reweighting; the weights change by less than 1 % after about six."""
+PROJECTION_ITERATIONS = 6
+"""Fixed-point iterations from the plane to the image."""
+CONTOUR_SMOOTHING = 1.5
+"""Standard deviation of the Gaussian on the distance to the contour, against steps of single pixels [px]."""
+CORNER_TOLERANCE = 0.25
+"""Distance of the contour from a polygon through its corners [spacing]."""
+MIN_CONTOUR_GAP = 0.5
+"""Smallest distance of two neighbouring particles on the contour [spacing]."""
+MIN_LATTICE_DEPTH = 0.6
+"""Smallest distance of the lattice's particles from the contour's [spacing]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMesh:
-    """A mesh over the first image."""
+    """Mesh over the first image."""
 
     uvd: Float[np.ndarray, "n 3"]
     """Left pixel and disparity of each particle in the first frame [px]."""
     rest: Float[np.ndarray, "n 3"]
-    """World [m]."""
+    """World position of each particle [m]."""
     faces: Int[np.ndarray, "f 3"]
-    """Counter-clockwise as the camera sees them."""
+    """Particles of each triangle, counter-clockwise as the camera sees them."""
 
 
 def lay_mesh(
@@ -57,41 +62,44 @@ def lay_mesh(
     camera: StereoCamera,
     *,
     spacing: float,
+    config: SheetMeshConfig | None = None,
 ) -> ImageMesh:
-    """Particles and triangles over one connected sheet.
+    """Return particles and triangles over one connected sheet.
 
     Args:
         mask: pixels of the sheet.
-        disparity: [px], NaN where unknown.
+        disparity: disparity of each pixel [px], NaN where unknown.
         camera: the calibrated pair.
         spacing: distance between neighbouring particles [m].
+        config: settings of the mesh; the defaults if None.
 
     Raises:
         PerceptionError: no disparity on the tissue, too few particles, or a mesh in several pieces.
     """
-    surface = surface_through(mask, disparity)
+    config = config or SheetMeshConfig()
+    surface = surface_through(mask, disparity, config)
     rows, columns = np.nonzero(mask)
-    pick = slice(None, None, max(1, len(rows) // MOST_SAMPLES))
+    pick = slice(None, None, max(1, len(rows) // MAX_SURFACE_SAMPLES))
     cloud = camera.back_project(surface(np.stack([columns[pick], rows[pick]], axis=-1).astype(float)))
     frame = _PlaneFrame(cloud, camera, surface)
 
     pixel = _pixel_size(cloud, camera)
-    outline = _outline(mask, INSET * spacing / pixel, frame)
-    rim = _resample(outline, spacing, tolerance=0.25 * spacing)
+    outline = _outline(mask, config.inset * spacing / pixel, frame)
+    rim = _resample(outline, spacing, tolerance=CORNER_TOLERANCE * spacing)
     inner = _lattice(outline, spacing)
     flat = np.concatenate([rim, inner])
-    if len(flat) < FEWEST_PARTICLES:
+    if len(flat) < config.min_particles:
         raise PerceptionError(
-            f"the sheet carries {len(flat)} particles at a spacing of {spacing * 1e3:g} mm, at least "
-            f"{FEWEST_PARTICLES} are needed; move the camera closer or lower the spacing."
+            f"the sheet has room for {len(flat)} particles at a spacing of {spacing * 1e3:g} mm, at least "
+            f"{config.min_particles} are needed; move the camera closer or lower the spacing."
         )
-    flat, faces = _triangulate(flat, outline, spacing)
+    flat, faces = _triangulate(flat, outline, spacing, config)
     uvd = frame.to_image(flat)
     return ImageMesh(uvd=uvd, rest=camera.back_project(uvd), faces=faces)
 
 
 class DisparitySurface:
-    """A polynomial d(u, v) through disparities, robust against mismatches.
+    """Polynomial d(u, v) through disparities, robust against mismatches.
 
     Iteratively reweighted least squares with Cauchy weights, their scale s from the median absolute residual. The
     degree is the one with the least robust Bayesian information criterion,
@@ -101,72 +109,86 @@ class DisparitySurface:
     with k coefficients, m samples and the scale s of the highest degree.
     """
 
-    def __init__(self, pixels: Float[np.ndarray, "m 2"], disparity: Float[np.ndarray, " m"]):
+    def __init__(
+        self,
+        pixels: Float[np.ndarray, "m 2"],
+        disparity: Float[np.ndarray, " m"],
+        config: SheetMeshConfig | None = None,
+    ):
+        highest = (config or SheetMeshConfig()).max_degree
         self._middle, self._scale = pixels.mean(axis=0), pixels.std(axis=0).max()
-        fits = [self._fit(pixels, disparity, degree) for degree in range(1, HIGHEST_DEGREE + 1)]
+        fits = [self._fit(pixels, disparity, degree) for degree in range(1, highest + 1)]
         scale = _scale_of(fits[-1][1])
         criteria = [
-            np.sum(CAUCHY**2 * np.log1p((residual / (CAUCHY * scale)) ** 2)) + len(coefficients) * np.log(len(residual))
-            for coefficients, residual in fits
+            _cauchy_cost(residual, scale) + len(coefficients) * np.log(len(residual)) for coefficients, residual in fits
         ]
         self.degree = int(np.argmin(criteria)) + 1
+        """Degree of the polynomial."""
         self._coefficients = fits[self.degree - 1][0]
 
     def __call__(self, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
-        """Pixel and fitted disparity [px]."""
+        """Return pixels with their fitted disparity [px]."""
         disparity = self._basis(pixels, self.degree) @ self._coefficients
         return np.concatenate([pixels, disparity[:, None]], axis=-1)
 
     def _basis(self, pixels: Float[np.ndarray, "m 2"], degree: int) -> Float[np.ndarray, "m k"]:
+        """Return the monomials of up to a degree in the normalised pixels."""
         x, y = ((pixels - self._middle) / self._scale).T
         return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
 
     def _fit(
         self, pixels: Float[np.ndarray, "m 2"], disparity: Float[np.ndarray, " m"], degree: int
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " m"]]:
-        """Coefficients and residuals."""
+        """Return the coefficients and residuals of one degree."""
         basis, weight = self._basis(pixels, degree), np.ones(len(disparity))
         coefficients, residual = np.zeros(basis.shape[1]), disparity
         for _ in range(REWEIGHTINGS):
             root = np.sqrt(weight)
             coefficients = np.linalg.lstsq(basis * root[:, None], disparity * root, rcond=None)[0]
             residual = disparity - basis @ coefficients
-            weight = 1 / (1 + (residual / (CAUCHY * _scale_of(residual))) ** 2)
+            weight = 1 / (1 + (residual / (CAUCHY_SCALE * _scale_of(residual))) ** 2)
         return coefficients, residual
 
 
+def _cauchy_cost(residual: Float[np.ndarray, " m"], scale: float) -> float:
+    """Return the sum of the robust cost over all samples."""
+    return np.sum(CAUCHY_SCALE**2 * np.log1p((residual / (CAUCHY_SCALE * scale)) ** 2))
+
+
 def _scale_of(residual: Float[np.ndarray, " m"]) -> float:
-    """Robust standard deviation: 1.4826 times the median absolute residual."""
-    return max(1.4826 * float(np.median(np.abs(residual))), FINEST_DISPARITY)
+    """Return a robust standard deviation, from the median absolute residual [px]."""
+    return max(MAD_TO_SD * float(np.median(np.abs(residual))), MIN_DISPARITY_SD)
 
 
 def surface_through(
-    mask: Bool[np.ndarray, "height width"], disparity: Float[np.ndarray, "height width"]
+    mask: Bool[np.ndarray, "height width"], disparity: Float[np.ndarray, "height width"], config: SheetMeshConfig
 ) -> DisparitySurface:
-    """The surface through a dense disparity on the tissue.
+    """Return the surface through a dense disparity [px] on the tissue.
 
     Raises:
-        PerceptionError: fewer than a fifth of the tissue's pixels have a disparity.
+        PerceptionError: less than `SheetMeshConfig.min_matched` of the tissue's pixels have a disparity.
     """
     rows, columns = np.nonzero(mask & (np.nan_to_num(disparity) > 0))
     share = len(rows) / max(int(mask.sum()), 1)
-    if share < LEAST_MATCHED:
+    if share < config.min_matched:
         raise PerceptionError(
-            f"only {share:.0%} of the tissue has a positive disparity, at least {LEAST_MATCHED:.0%} is needed: are the "
-            "left and right cameras swapped, the pair not rectified, the tissue without texture, or too near?"
+            f"only {share:.0%} of the tissue has a positive disparity, at least {config.min_matched:.0%} is needed: "
+            "are the left and right cameras swapped, the pair not rectified, the tissue without texture, or too near?"
         )
-    pick = slice(None, None, max(1, len(rows) // MOST_SAMPLES))
+    pick = slice(None, None, max(1, len(rows) // MAX_SURFACE_SAMPLES))
     pixels = np.stack([columns[pick], rows[pick]], axis=-1).astype(float)
-    return DisparitySurface(pixels, disparity[rows[pick], columns[pick]].astype(float))
+    return DisparitySurface(pixels, disparity[rows[pick], columns[pick]].astype(float), config)
 
 
 class _PlaneFrame:
-    """Coordinates in the plane that fits the sheet best [m], and the way from there to the image and back."""
+    """Coordinates in the plane that fits the sheet best [m], with maps to the image and back."""
 
     def __init__(self, cloud: Float[np.ndarray, "m 3"], camera: StereoCamera, surface: DisparitySurface):
         self._camera, self._surface = camera, surface
         self._origin = np.median(cloud, axis=0)
-        _, _, axes = np.linalg.svd(cloud[:: max(1, len(cloud) // 4000)] - self._origin, full_matrices=False)
+        _, _, axes = np.linalg.svd(
+            cloud[:: max(1, len(cloud) // MAX_PLANE_SAMPLES)] - self._origin, full_matrices=False
+        )
         normal = axes[2] * np.sign(axes[2] @ (camera.T_world_camera[:3, 3] - self._origin))
         right = camera.T_world_camera[:3, 0]
         first = right - normal * (normal @ right)
@@ -174,46 +196,52 @@ class _PlaneFrame:
         self._axes = np.stack([first, np.cross(normal, first)])
 
     def from_image(self, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
-        """Pixels to the plane, through the fitted surface."""
+        """Return pixels in the plane [m], through the fitted surface."""
         return (self._camera.back_project(self._surface(pixels)) - self._origin) @ self._axes.T
 
     def to_image(self, flat: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
-        """Points of the plane to pixel and disparity, by fixed-point iteration on the surface's height."""
+        """Return points of the plane as pixel and disparity [px], by fixed-point iteration on the surface's height."""
         guess = flat
-        for _ in range(6):
+        for _ in range(PROJECTION_ITERATIONS):
             pixels = self._camera.project(self._origin + guess @ self._axes)[:, :2]
             guess = guess + flat - self.from_image(pixels)
         return self._surface(self._camera.project(self._origin + guess @ self._axes)[:, :2])
 
 
 def _pixel_size(cloud: Float[np.ndarray, "m 3"], camera: StereoCamera) -> float:
-    """Size of a pixel at the sheet's median depth [m]."""
+    """Return the size of a pixel at the sheet's median depth [m]."""
     depth = np.median((cloud - camera.T_world_camera[:3, 3]) @ camera.T_world_camera[:3, 2])
     return float(depth / camera.focal[0])
 
 
 def _outline(mask: Bool[np.ndarray, "height width"], inset: float, frame: _PlaneFrame) -> Float[np.ndarray, "m 2"]:
-    """The sheet's contour, smoothed, `inset` pixels inside the mask, as a closed polygon in the plane [m]."""
+    """Return the sheet's smoothed contour, `inset` pixels inside the mask, as a closed polygon in the plane [m].
+
+    Raises:
+        PerceptionError: the tissue is too thin, or its parts are joined by less than the inset.
+    """
     framed = np.pad(mask.astype(np.uint8), 1)
     filled = np.zeros_like(framed)
     contours, _ = cv2.findContours(framed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(filled, [max(contours, key=cv2.contourArea)], -1, 1, cv2.FILLED)
-    depth = cv2.GaussianBlur(cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), (0, 0), 1.5)
+    depth = cv2.GaussianBlur(
+        cv2.distanceTransform(filled, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), (0, 0), CONTOUR_SMOOTHING
+    )
     contours, _ = cv2.findContours((depth > inset).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
         raise PerceptionError("the tissue is thinner than the mesh's inset from its rim; lower the spacing.")
     largest, *others = sorted(contours, key=cv2.contourArea, reverse=True)
-    if others and cv2.contourArea(others[0]) > SECOND_BLOB * cv2.contourArea(largest):
+    if others and cv2.contourArea(others[0]) > MAX_SECOND_BLOB * cv2.contourArea(largest):
         raise PerceptionError(
-            "two disconnected sheets in view: the tissue's parts hang together by less than the mesh's spacing; one "
-            "sheet is tracked: cover the other, or pass a mask that leaves it out."
+            "two disconnected sheets in view: the tissue's parts are joined by less than the mesh's spacing; only one "
+            "sheet can be tracked: cover the other, or pass a mask that leaves it out."
         )
     contour = largest[:, 0, :].astype(float) - 1
     return frame.from_image(contour)
 
 
 def _resample(outline: Float[np.ndarray, "m 2"], spacing: float, *, tolerance: float) -> Float[np.ndarray, "k 2"]:
-    """Points along a closed polygon, its corners kept, otherwise about `spacing` apart."""
+    """Return points along a closed polygon, about `spacing` [m] apart, its corners among them."""
     scaled = (outline / tolerance).astype(np.float32)
     corners = cv2.approxPolyDP(scaled[:, None], 1.0, True)[:, 0]
     where = np.sort([int(np.argmin(np.sum((scaled - corner) ** 2, axis=1))) for corner in corners])
@@ -226,32 +254,32 @@ def _resample(outline: Float[np.ndarray, "m 2"], spacing: float, *, tolerance: f
         points.append(np.stack([np.interp(at, length, part[:, axis]) for axis in range(2)], axis=-1))
     points = np.concatenate(points)
     gap = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
-    return points[gap > 0.5 * spacing]
+    return points[gap > MIN_CONTOUR_GAP * spacing]
 
 
 def _lattice(outline: Float[np.ndarray, "m 2"], spacing: float) -> Float[np.ndarray, "k 2"]:
-    """Hexagonal lattice points inside a polygon, at least 0.6 spacings from it."""
+    """Return the points of a hexagonal lattice inside a polygon, at least `MIN_LATTICE_DEPTH` from it [m]."""
     low, high = outline.min(axis=0), outline.max(axis=0)
     rise = spacing * np.sqrt(3) / 2
     n_rows, n_columns = (np.ceil((high - low)[::-1] / (rise, spacing)) + 1).astype(int)
     row, column = np.mgrid[:n_rows, :n_columns]
     points = np.stack([column + 0.5 * (row % 2), row], axis=-1).reshape(-1, 2) * (spacing, rise)
     points += (low + high) / 2 - points.mean(axis=0)
-    return points[_depth_inside(points, outline, spacing) > 0.6 * spacing]
+    return points[_depth_inside(points, outline, spacing) > MIN_LATTICE_DEPTH * spacing]
 
 
 def _depth_inside(
     points: Float[np.ndarray, "k 2"], outline: Float[np.ndarray, "m 2"], unit: float
 ) -> Float[np.ndarray, " k"]:
-    """Distance to a polygon [m], negative outside; `unit` [m] sets the scale of the float32 arithmetic."""
+    """Return the distance to a polygon [m], negative outside; `unit` [m] sets the scale of the float32 arithmetic."""
     polygon = (outline / unit).astype(np.float32)[:, None]
     return unit * np.array([cv2.pointPolygonTest(polygon, (float(x), float(y)), True) for x, y in points / unit])
 
 
 def _triangulate(
-    points: Float[np.ndarray, "n 2"], outline: Float[np.ndarray, "m 2"], spacing: float
+    points: Float[np.ndarray, "n 2"], outline: Float[np.ndarray, "m 2"], spacing: float, config: SheetMeshConfig
 ) -> tuple[Float[np.ndarray, "k 2"], Int[np.ndarray, "f 3"]]:
-    """Delaunay triangles inside the outline without needles; particles without a triangle are dropped.
+    """Return Delaunay triangles inside the outline without needles, and the particles that have a triangle.
 
     Raises:
         PerceptionError: the triangles form several pieces.
@@ -259,12 +287,13 @@ def _triangulate(
     faces = Delaunay(points).simplices
     corner = points[faces]
     edge = np.roll(corner, -1, axis=1) - corner
-    turn = edge[:, 0, 0] * edge[:, 1, 1] - edge[:, 0, 1] * edge[:, 1, 0]
-    faces[turn < 0] = faces[turn < 0][:, ::-1]
+    cross = edge[:, 0, 0] * edge[:, 1, 1] - edge[:, 0, 1] * edge[:, 1, 0]
+    faces[cross < 0] = faces[cross < 0][:, ::-1]
     length = np.linalg.norm(edge, axis=2)
-    smallest = np.abs(turn) / (length * np.roll(length, -1, axis=1)).max(axis=1)  # sine, between the two longest sides
+    sine = np.abs(cross) / (length * np.roll(length, -1, axis=1)).max(axis=1)  # between the two longest sides
     inside = _depth_inside(corner.mean(axis=1), outline, spacing) > 0
-    faces = faces[inside & (smallest > np.sin(np.radians(SMALLEST_ANGLE))) & (length.max(axis=1) < 2.5 * spacing)]
+    blunt = sine > np.sin(np.radians(config.min_angle))
+    faces = faces[inside & blunt & (length.max(axis=1) < config.max_edge * spacing)]
     used, faces = np.unique(faces, return_inverse=True)
     faces = faces.reshape(-1, 3)
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
@@ -272,7 +301,7 @@ def _triangulate(
     pieces, label = connected_components(graph, directed=False)
     if pieces > 1:
         raise PerceptionError(
-            f"the sheet's mesh falls into {pieces} pieces of {np.bincount(label).tolist()} particles; the tissue in "
-            "view must be one connected sheet, wider than two spacings everywhere."
+            f"the sheet's mesh falls into {pieces} pieces of {np.bincount(label).tolist()} particles; show one "
+            "connected sheet, wider than two spacings everywhere, or lower the spacing."
         )
     return points[used], faces

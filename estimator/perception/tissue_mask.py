@@ -1,9 +1,9 @@
-"""Which pixels are tissue, from appearance alone.
+"""Segmentation of tissue by colour.
 
-The shipped `WarmTissue` takes soft tissue to be warm (the red-green and blue-yellow axes of CIE L*a*b*; perfused
-tissue is red to yellow, instruments are grey, drapes and beds are green, blue or grey). It splits the warm side by
-Otsu's threshold (Otsu 1979, doi:10.1109/TSMC.1979.4310076). A learned model plugs in through `TissueMask`.
-Does not decide what the sheet is: `largest_blob` does, and refuses two sheets.
+The shipped `WarmTissue` assumes that soft tissue is warm on the red-green axis of CIE L*a*b*: perfused tissue is red to
+yellow, instruments are grey, drapes and beds are green, blue or grey. It splits the warm side by Otsu's threshold (Otsu
+1979, doi:10.1109/TSMC.1979.4310076). A learned model plugs in through `TissueMask`. `largest_blob` then selects the
+sheet, and refuses two sheets.
 """
 
 from dataclasses import dataclass
@@ -15,27 +15,31 @@ from jaxtyping import Bool, UInt8
 
 from jiggle_mj.errors import PerceptionError
 
-SECOND_BLOB = 0.25
-"""A second blob above this fraction of the largest one's area is a second sheet, not a fleck."""
+MAX_SECOND_BLOB = 0.25
+"""Largest area of a second blob that is a fleck and not a second sheet [area of the largest blob]."""
+NEUTRAL = 128
+"""Value of a* in an 8-bit CIE L*a*b* image that is neither red nor green."""
+MAX_FLECK, MAX_HOLE = 3, 5
+"""Widths of the squares that remove flecks (opening) and fill holes (closing) [px]."""
 
 
 @runtime_checkable
 class TissueMask(Protocol):
-    """Anything that says which pixels are tissue."""
+    """A segmentation of tissue."""
 
     def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Bool[np.ndarray, "height width"]:
-        """Tissue pixels of an RGB image."""
+        """Return the tissue pixels of an RGB image."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class WarmTissue:
-    """Tissue is what is clearly redder than grey and redder than the rest of the image."""
+    """Segmentation of pixels that are clearly redder than grey and redder than the rest of the image."""
 
     redness: float = 6.0
     """Smallest a* (CIE L*a*b*, 8-bit scale around 128) that can be tissue; grey is 0, raw meat about 30."""
     smoothing: float = 1.5
-    """Standard deviation of the Gaussian that quiets colour noise first [px]."""
+    """Standard deviation of the Gaussian that reduces colour noise first [px]."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -45,18 +49,18 @@ class WarmTissue:
             )
 
     def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Bool[np.ndarray, "height width"]:
-        """Tissue pixels of an RGB image; nothing where the image holds nothing warm."""
+        """Return the tissue pixels of an RGB image; none if no pixel is warm."""
         smooth = cv2.GaussianBlur(image, (0, 0), self.smoothing)
         a_star = cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB)[..., 1]
-        warmth = np.clip(a_star.astype(np.int16) - 128, 0, 127).astype(np.uint8)
+        warmth = np.clip(a_star.astype(np.int16) - NEUTRAL, 0, 127).astype(np.uint8)
         otsu, _ = cv2.threshold(warmth, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
         tissue = (warmth > max(otsu, self.redness)).astype(np.uint8)
-        tissue = cv2.morphologyEx(tissue, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        return cv2.morphologyEx(tissue, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)).astype(bool)
+        tissue = cv2.morphologyEx(tissue, cv2.MORPH_OPEN, np.ones((MAX_FLECK, MAX_FLECK), np.uint8))
+        return cv2.morphologyEx(tissue, cv2.MORPH_CLOSE, np.ones((MAX_HOLE, MAX_HOLE), np.uint8)).astype(bool)
 
 
 def largest_blob(mask: Bool[np.ndarray, "height width"], *, smallest: int) -> Bool[np.ndarray, "height width"]:
-    """The one connected sheet of a mask.
+    """Return the one connected sheet of a mask.
 
     Args:
         mask: tissue pixels.
@@ -68,15 +72,15 @@ def largest_blob(mask: Bool[np.ndarray, "height width"], *, smallest: int) -> Bo
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     areas = stats[1:, cv2.CC_STAT_AREA]
     if not areas.size or areas.max() < smallest:
-        found = int(areas.max()) if areas.size else 0
+        area = int(areas.max()) if areas.size else 0
         raise PerceptionError(
-            f"no tissue in view: the largest patch of tissue colour has {found} px, at least {smallest} are needed; "
-            "point the camera at the tissue, or pass a mask that knows its colour."
+            f"no tissue in view: the largest patch of tissue colour has {area} px, at least {smallest} are needed; "
+            "point the camera at the tissue, or pass a mask for its colour."
         )
     order = np.argsort(-areas, kind="stable")
-    if areas.size > 1 and areas[order[1]] > SECOND_BLOB * areas[order[0]]:
+    if areas.size > 1 and areas[order[1]] > MAX_SECOND_BLOB * areas[order[0]]:
         raise PerceptionError(
-            f"two disconnected sheets in view ({areas[order[0]]} and {areas[order[1]]} px); one connected sheet is "
-            "tracked: cover the other, or pass a mask that leaves it out."
+            f"two disconnected sheets in view ({areas[order[0]]} and {areas[order[1]]} px); only one sheet "
+            "can be tracked: cover the other, or pass a mask that leaves it out."
         )
     return labels == order[0] + 1

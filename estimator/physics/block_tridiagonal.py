@@ -2,12 +2,12 @@
 
 Particles in a good order interact only within a band; cutting the order into blocks as wide as the band leaves a
 block-tridiagonal matrix, whose Cholesky factor costs O(n band^2) instead of O(n^3). `Layout` holds the order,
-`BlockTridiagonal` the numbers. Every particle carries three degrees of freedom. Not a general sparse solver: the band
-must fit.
+`BlockTridiagonal` the numbers. Every particle has three degrees of freedom. This is not a general sparse solver:
+every pair of coupled particles must lie within the band.
 
 Blocks are eliminated from both ends towards the middle [the twisted factorisation: van der Vorst 1987, Parallel
-Computing 5:45]. It is as much work, but a GPU, which waits for each block, goes through both halves at once, and a
-right-hand side that is banded itself stays sparse for longer.
+Computing 5:45]. The work is the same, but a GPU, which waits for each block, eliminates both halves at once, and a
+banded right-hand side stays sparse for longer.
 """
 
 from collections.abc import Callable
@@ -23,21 +23,21 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-SWEEPS = 36
-"""Directions in which an order along a line is tried."""
-SMALL = 64
-"""Triangles up to this size are inverted by substitution."""
+ORDER_DIRECTIONS = 36
+"""Directions in the sheet's plane along which an order of the particles is tried: one every 5 degrees."""
+MAX_SUBSTITUTION_SIZE = 64
+"""Largest triangular matrix that is inverted by substitution; larger ones are inverted by halves [rows]."""
 
 
 class Layout(eqx.Module):
-    """Which particle sits where in the blocks; the last block is padded."""
+    """Place of each particle in the blocks; the last block is padded."""
 
     slot: Int[np.ndarray, " n"] | Int[Array, " n"]
     """Place of each particle in the padded order."""
     n_blocks: int = eqx.field(static=True)
-    """Odd, so that one is in the middle."""
+    """Number of blocks; odd, so that one is in the middle."""
     width: int = eqx.field(static=True)
-    """Particles in a block."""
+    """Number of particles in a block."""
 
     @classmethod
     def from_pattern(cls, pattern: sp.csr_matrix, points: Float[np.ndarray, "n d"] | None = None) -> "Layout":
@@ -51,7 +51,7 @@ class Layout(eqx.Module):
         if points is not None:
             centred = points - points.mean(axis=0)
             plane = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
-            angles = np.linspace(0, np.pi, SWEEPS, endpoint=False)
+            angles = np.linspace(0, np.pi, ORDER_DIRECTIONS, endpoint=False)
             orders += [np.argsort(plane @ (np.cos(angle), np.sin(angle)), kind="stable") for angle in angles]
         ranks = [np.argsort(order) for order in orders]
         bands = [max(1, int(np.abs(rank[rows] - rank[columns]).max(initial=1))) for rank in ranks]
@@ -60,29 +60,32 @@ class Layout(eqx.Module):
         return cls(slot=ranks[best], n_blocks=n_blocks, width=-(-n // n_blocks))
 
     def blocks(self, values: Float[Array, "n ..."]) -> Float[Array, "blocks width ..."]:
-        """Lay particle rows out in blocks; padding is zero."""
+        """Arrange one row per particle in blocks; padding is zero."""
         rest = values.shape[1:]
         padded = jnp.zeros((self.n_blocks * self.width, *rest), values.dtype).at[self.slot].set(values)
         return padded.reshape(self.n_blocks, self.width, *rest)
 
     def rows(self, blocks: Float[Array, "blocks width ..."]) -> Float[Array, "n ..."]:
-        """The inverse of `blocks`."""
+        """Return one row per particle from blocks: the inverse of `blocks`."""
         return blocks.reshape(self.n_blocks * self.width, *blocks.shape[2:])[self.slot]
 
     def pair_index(self, vertices: Int[np.ndarray, "m p"]) -> Int[np.ndarray, "m p p"]:
-        """Where the 3x3 window of each ordered vertex pair of an element is stored; pairs above the diagonal fall off.
+        """Return where the 3x3 window of each ordered vertex pair of an element is stored.
 
-        A vertex of -1 stands for 'none'.
+        Pairs above the diagonal get an index past the end, and are dropped. A vertex of -1 means 'none'.
 
         Raises:
-            ValueError: a pair lies outside the band that the layout was made for.
+            ValueError: a pair lies outside the band of the layout.
         """
         rank = np.append(np.asarray(self.slot), -1)[vertices]
         row, column = rank[:, :, None], rank[:, None, :]
         jump = row // self.width - column // self.width
         absent = (row < 0) | (column < 0)
         if np.any((np.abs(jump) > 1) & ~absent):
-            raise ValueError("an element couples particles further apart than the layout's band.")
+            raise ValueError(
+                "an element couples particles that are further apart than the layout's band; build the Layout from a "
+                "pattern that holds every pair of every element."
+            )
         window = (jump * self.n_blocks + column // self.width) * self.width**2
         window = window + (row % self.width) * self.width + column % self.width
         return np.where(absent | (jump < 0), 2 * self.n_blocks * self.width**2, window)
@@ -92,28 +95,29 @@ class BlockTridiagonal(eqx.Module):
     """A symmetric block-tridiagonal matrix."""
 
     diagonal: Float[Array, "blocks m m"]
+    """Blocks (k, k)."""
     lower: Float[Array, "blocks-1 m m"]
-    """Block (k + 1, k)."""
+    """Blocks (k + 1, k)."""
 
 
 class BlockCholesky(eqx.Module):
     """The factor L of A = L L^T, its rows and columns ordered from both ends to the middle.
 
-    The diagonal blocks are kept as inverses: products with them run several times faster than triangular solves.
+    The diagonal blocks are stored as inverses: products with them run several times faster than triangular solves.
     """
 
     inverse: Float[Array, "2 half m m"]
-    """Inverse of each diagonal block, from either end."""
+    """Inverse of each diagonal block of the factor, from either end."""
     inward: Float[Array, "2 half m m"]
-    """The block that couples each to the next towards the middle."""
+    """Block that couples each to the next one towards the middle."""
     middle: Float[Array, "m m"]
-    """Inverse of the middle's diagonal block."""
+    """Inverse of the middle's diagonal block of the factor."""
 
 
 def assemble(
     layout: Layout, elements: list[tuple[Int[Array, "_m _p _p"], Float[Array, "_m _p 3 _p 3"]]]
 ) -> BlockTridiagonal:
-    """Sum element matrices, each given with its `Layout.pair_index`; padding gets an identity."""
+    """Return the sum of element matrices, each given with its `Layout.pair_index`; padding gets an identity."""
     nb, w = layout.n_blocks, layout.width
     index = jnp.concatenate([i.reshape(-1) for i, _ in elements])
     windows = jnp.concatenate([jnp.swapaxes(h, 2, 3).reshape(-1, 3, 3) for _, h in elements])
@@ -130,7 +134,7 @@ def assemble(
 def add_to_diagonal(
     layout: Layout, matrix: BlockTridiagonal, windows: Float[Array, "n 3 3"], padding: float = 0.0
 ) -> BlockTridiagonal:
-    """Add a 3x3 window to each particle's place on the diagonal, and a multiple of the identity to the padding's."""
+    """Return the matrix with a 3x3 window added for each particle, and a multiple of the identity for the padding."""
     nb, w = layout.n_blocks, layout.width
     filled = jnp.broadcast_to(padding * jnp.eye(3, dtype=windows.dtype), (nb * w, 3, 3)).at[layout.slot].set(windows)
     place = jnp.arange(w)
@@ -140,7 +144,7 @@ def add_to_diagonal(
 
 
 def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
-    """Factor A = L L^T block by block; NaN where A is not positive definite."""
+    """Return the factor of A = L L^T, computed block by block; NaN where A is not positive definite."""
 
     def inverse_factor(block):
         return lower_inverse(jnp.linalg.cholesky(block, symmetrize_input=False))
@@ -159,9 +163,9 @@ def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
 
 
 def lower_inverse(factor: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Inverse of a lower triangular matrix, by halves: products run several times faster than triangular solves."""
+    """Return the inverse of a lower triangular matrix, by halves: products are several times faster than solves."""
     m = len(factor)
-    if m <= SMALL:
+    if m <= MAX_SUBSTITUTION_SIZE:
         return solve_triangular(factor, jnp.eye(m, dtype=factor.dtype), lower=True)
     first, last = lower_inverse(factor[: m // 2, : m // 2]), lower_inverse(factor[m // 2 :, m // 2 :])
     corner = -last @ (factor[m // 2 :, : m // 2] @ first)
@@ -169,7 +173,7 @@ def lower_inverse(factor: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 
 def multiply(layout: Layout, matrix: BlockTridiagonal, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """A x for one vector given per particle."""
+    """Return A x for one vector given per particle."""
     v = layout.blocks(x).reshape(layout.n_blocks, -1)
     out = jnp.einsum("bij,bj->bi", matrix.diagonal, v)
     out = out.at[1:].add(jnp.einsum("bij,bj->bi", matrix.lower, v[:-1]))
@@ -178,10 +182,10 @@ def multiply(layout: Layout, matrix: BlockTridiagonal, x: Float[Array, "n 3"]) -
 
 
 def lower_square(factor: BlockCholesky, rhs: Float[Array, "blocks m n"]) -> Float[Array, "n n"]:
-    """B^T A^-1 B of a right-hand side B with n / blocks columns a block, in the layout's order.
+    """Return B^T A^-1 B of a right-hand side B with n / blocks columns a block, in the layout's order.
 
-    Columns may reach no further than one block from their own, as those of a matrix in this layout do: in L^-1 B those
-    of the other end stay zero up to the middle, and are left out of the products.
+    Columns may reach no further than one block from their own, as those of a matrix in this layout do. In L^-1 B the
+    columns of the other end are then zero up to the middle, and the products omit them.
     """
     nb, m, n = rhs.shape
     half, w = nb // 2, n // nb
@@ -209,9 +213,9 @@ def lower_square(factor: BlockCholesky, rhs: Float[Array, "blocks m n"]) -> Floa
 
 
 def inverse_band(factor: BlockCholesky) -> BlockTridiagonal:
-    """The blocks of A^-1 that lie where A has blocks, from the middle outwards [Takahashi et al. 1973].
+    """Return the blocks of A^-1 at the places where A has blocks, from the middle outwards [Takahashi et al. 1973].
 
-    In single precision, in half the time: sums of products that are positive semi-definite lose no digits.
+    Computed in single precision, which takes half the time: sums of positive semi-definite products lose no digits.
     """
     dtype, factor = factor.middle.dtype, jax.tree.map(lambda part: part.astype(jnp.float32), factor)
     middle = factor.middle.T @ factor.middle
@@ -219,30 +223,37 @@ def inverse_band(factor: BlockCholesky) -> BlockTridiagonal:
     def step(following, blocks):
         inverse, inward = blocks
         coupling = inward @ inverse
-        beside = -following @ coupling
-        diagonal = inverse.T @ inverse - coupling.T @ beside
-        return diagonal, (diagonal, beside)
+        off_diagonal = -following @ coupling
+        diagonal = inverse.T @ inverse - coupling.T @ off_diagonal
+        return diagonal, (diagonal, off_diagonal)
 
     outwards = partial(jax.lax.scan, step, middle, reverse=True)
-    _, (ends, beside) = _from_both_ends(outwards, (factor.inverse, factor.inward))
-    lower = jnp.concatenate([beside[0], beside[1, ::-1].swapaxes(1, 2)])
+    _, (ends, off_diagonal) = _from_both_ends(outwards, (factor.inverse, factor.inward))
+    lower = jnp.concatenate([off_diagonal[0], off_diagonal[1, ::-1].swapaxes(1, 2)])
     return BlockTridiagonal(diagonal=_joined(ends, middle).astype(dtype), lower=lower.astype(dtype))
 
 
 def window_sums(
     layout: Layout, matrix: BlockTridiagonal, index: Int[Array, "m p p"], rows: Float[Array, "m p 3 3"]
 ) -> Float[Array, " m"]:
-    """Trace of B A B^T for each element's B, given as one 3x3 window a vertex; `index` is its `Layout.pair_index`."""
+    """Return the trace of B A B^T for each element.
+
+    Args:
+        layout: the layout of A.
+        matrix: A.
+        index: `Layout.pair_index` of the elements.
+        rows: each element's B, one 3x3 window per vertex.
+    """
     nb, w = layout.n_blocks, layout.width
     lower = jnp.concatenate([matrix.lower, jnp.zeros_like(matrix.diagonal[:1])])[:nb]
     blocks = jnp.stack([matrix.diagonal, lower]).reshape(2, nb, w, 3, w, 3).swapaxes(3, 4).reshape(-1, 3, 3)
     windows = jnp.concatenate([blocks, jnp.zeros((1, 3, 3), blocks.dtype)])[index]
-    twice = jnp.where((index >= nb * w * w)[..., None, None], 2.0, 1.0)
-    return jnp.einsum("mjab,mjkbc,mkac->m", rows, twice * windows, rows)
+    multiplicity = jnp.where((index >= nb * w * w)[..., None, None], 2.0, 1.0)
+    return jnp.einsum("mjab,mjkbc,mkac->m", rows, multiplicity * windows, rows)
 
 
 def solve(layout: Layout, factor: BlockCholesky, rhs: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """A z = rhs for one right-hand side given per particle."""
+    """Return the solution z of A z = rhs for one right-hand side given per particle."""
 
     def forward(taken, blocks):
         inverse, inward, right = blocks
@@ -263,16 +274,16 @@ def solve(layout: Layout, factor: BlockCholesky, rhs: Float[Array, "n 3"]) -> Fl
 
 
 def _from_both_ends(run: Callable[[Any], Any], blocks: Any) -> Any:
-    """`run` for either end's blocks, the first axis: one after the other on a CPU, whose cores share each product."""
+    """Apply `run` to the blocks of either end, the first axis: in turn on a CPU, whose cores share each product."""
     return jax.lax.platform_dependent(blocks, cpu=partial(jax.lax.map, run), default=jax.vmap(run))
 
 
 def _split(blocks: Float[Array, "blocks ..."]) -> tuple[Float[Array, "2 half ..."], Float[Array, "..."]]:
-    """The blocks from either end towards the middle, and the middle."""
+    """Return the blocks from either end towards the middle, and the middle one."""
     half = len(blocks) // 2
     return jnp.stack([blocks[:half], blocks[half + 1 :][::-1]]), blocks[half]
 
 
 def _joined(ends: Float[Array, "2 half ..."], middle: Float[Array, "..."]) -> Float[Array, "blocks ..."]:
-    """The inverse of `_split`."""
+    """Return the blocks in order: the inverse of `_split`."""
     return jnp.concatenate([ends[0], middle[None], ends[1, ::-1]])

@@ -2,9 +2,9 @@
 
     U(x; b) = sum of terms + 1/2 sum_i b_i |x_i - a_i|^2
 
-A `Term` is a batch of alike elements, each over a few particles; it need only state its energy: gradient and Hessian
-follow by differentiation, and a term that writes them out is checked against that in the tests. The boundary springs b
-are the unknown of the whole project and stand apart. Quasi-static: no mass, no velocity.
+A `Term` is a batch of elements of one kind, each over a few particles. It needs only an energy: gradient and Hessian
+follow by differentiation, and the tests compare a term that writes them out with that. The boundary springs b are the
+unknown of the whole project, so they are an argument and not a term. The model is quasi-static: no mass, no velocity.
 """
 
 from abc import abstractmethod
@@ -19,28 +19,31 @@ from .block_tridiagonal import BlockTridiagonal, Layout, add_to_diagonal, assemb
 
 
 class Term(eqx.Module):
-    """Elements of one kind."""
+    """A batch of energy elements of one kind."""
 
     vertices: eqx.AbstractVar[Int[np.ndarray, "m p"] | Int[Array, "m p"]]
-    """Particles of each element."""
+    """Indices of each element's particles."""
 
     @abstractmethod
     def energy(self, x: Float[Array, "m p 3"]) -> Float[Array, " m"]:
-        """Energy of each element [J] at its particles' positions [m]."""
+        """Return the energy of each element [J] at its particles' positions [m]."""
 
     def gradient(self, x: Float[Array, "m p 3"]) -> Float[Array, "m p 3"]:
-        """Derivative of the energy [N]."""
+        """Return the derivative of each element's energy [N]."""
         return jax.grad(lambda y: jnp.sum(self.energy(y)))(x)
 
     def hessian(self, x: Float[Array, "m p 3"]) -> Float[Array, "m p 3 p 3"]:
-        """Second derivative of the energy [N/m]."""
+        """Return the second derivative of each element's energy [N/m]."""
         _, p, _ = x.shape
         directions = jnp.eye(3 * p, dtype=x.dtype).reshape(3 * p, 1, p, 3)
         column = lambda d: jax.jvp(self.gradient, (x,), (jnp.broadcast_to(d, x.shape),))[1]  # noqa: E731
         return jnp.moveaxis(jax.vmap(column)(directions).reshape(p, 3, *x.shape), (0, 1), (3, 4))
 
     def positive_hessian(self, x: Float[Array, "m p 3"]) -> Float[Array, "m p 3 p 3"]:
-        """A positive semi-definite stand-in for the Hessian, for Newton steps: negative eigenvalues become zero."""
+        """Return a positive semi-definite stand-in for the Hessian [N/m], with negative eigenvalues set to zero.
+
+        Newton steps use it.
+        """
         m, p, _ = x.shape
         values, vectors = jnp.linalg.eigh(self.hessian(x).reshape(m, 3 * p, 3 * p))
         clamped = (vectors * jnp.maximum(values, 0)[:, None, :]) @ vectors.swapaxes(1, 2)
@@ -48,44 +51,51 @@ class Term(eqx.Module):
 
 
 class SheetEnergy(eqx.Module):
-    """The energy of one sheet: its terms, its rest positions, and where their Hessians go."""
+    """Energy of one sheet: its terms, its rest positions, and the places of the terms' Hessians."""
 
     rest: Float[Array, "n 3"]
     """Anchors a of the boundary springs [m]."""
     terms: tuple[Term, ...]
+    """Elements of every kind."""
     layout: Layout
+    """Order of the particles in the Hessian."""
     places: tuple[Int[Array, "_m _p _p"], ...]
+    """`Layout.pair_index` of each term."""
 
     @classmethod
     def build(cls, rest: Float[np.ndarray, "n 3"], terms: tuple[Term, ...], layout: Layout) -> "SheetEnergy":
-        """Prepare the assembly of every term's Hessian in the given layout."""
+        """Build the energy, with the places of every term's Hessian in the given layout.
+
+        Raises:
+            ValueError: a term couples particles outside the layout's band.
+        """
         places = tuple(jnp.asarray(layout.pair_index(np.asarray(term.vertices))) for term in terms)
         return cls(rest=jnp.asarray(rest), terms=terms, layout=layout, places=places)
 
     def value(self, x: Float[Array, "n 3"], b: Float[Array, " n"]) -> Float[Array, ""]:
-        """U(x; b) [J]."""
+        """Return U(x; b) [J]."""
         boundary = 0.5 * jnp.sum(b[:, None] * (x - self.rest) ** 2)
         return boundary + sum(jnp.sum(term.energy(x[term.vertices])) for term in self.terms)
 
     def internal_gradient(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """Gradient of all but the boundary springs [N]."""
+        """Return the gradient of all terms, without the boundary springs [N]."""
         total = jnp.zeros_like(x)
         for term in self.terms:
             total = total.at[term.vertices].add(term.gradient(x[term.vertices]))
         return total
 
     def gradient(self, x: Float[Array, "n 3"], b: Float[Array, " n"]) -> Float[Array, "n 3"]:
-        """Gradient of U [N]; minus the force on each particle."""
+        """Return the gradient of U [N], which is minus the force on each particle."""
         return self.internal_gradient(x) + b[:, None] * (x - self.rest)
 
     def value_and_gradient(
         self, x: Float[Array, "n 3"], b: Float[Array, " n"]
     ) -> tuple[Float[Array, ""], Float[Array, "n 3"]]:
-        """Both at once."""
+        """Return U [J] and its gradient [N]."""
         return self.value(x, b), self.gradient(x, b)
 
     def hessian(self, x: Float[Array, "n 3"], b: Float[Array, " n"], *, positive: bool = False) -> BlockTridiagonal:
-        """Hessian of U [N/m]; `positive` asks for the projected one that Newton steps use."""
+        """Return the Hessian of U [N/m]; with `positive`, the projected one that Newton steps use."""
         elements = [
             (place, (term.positive_hessian if positive else term.hessian)(x[term.vertices]))
             for term, place in zip(self.terms, self.places, strict=True)

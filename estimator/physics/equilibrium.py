@@ -1,9 +1,9 @@
 """The sheet's equilibrium x*(b, u) = argmin U by projected Newton, differentiated by the implicit function theorem.
 
-Each step solves with the positive semi-definite stand-in of the Hessian, roughly if that is enough (an inexact Newton
-method [Dembo, Eisenstat & Steihaug 1982, doi:10.1137/0719025]), and backtracks until the energy falls enough (Armijo's
-rule). Derivatives use the true Hessian at the solution: dx/dtheta = -H^-1 d(grad U)/dtheta. A step that cannot lower
-the energy ends the search and is reported, not hidden.
+Each step solves with the positive semi-definite stand-in of the Hessian. It solves in single precision if that is
+accurate enough (an inexact Newton method [Dembo, Eisenstat & Steihaug 1982, doi:10.1137/0719025]), and backtracks until
+the energy falls enough (Armijo's rule). Derivatives use the true Hessian at the solution:
+dx/dtheta = -H^-1 d(grad U)/dtheta. A step that cannot lower the energy ends the search, and the result says so.
 """
 
 from functools import partial
@@ -16,19 +16,29 @@ from jaxtyping import Array, Bool, Float, Int
 from .block_tridiagonal import BlockTridiagonal, Layout, add_to_diagonal, cholesky, multiply, solve
 from .energy import SheetEnergy
 
-ROUGH = 0.1
-"""Share of the unbalanced force that a step may leave in the linear model."""
+MAX_LINEAR_RESIDUAL = 0.1
+"""Largest residual of the linear system that a single-precision step may have [unbalanced force]."""
+HESSIAN_SHIFT = 1e-9
+"""Multiple of the identity that makes the positive semi-definite Hessian definite [its largest diagonal entry]."""
+ARMIJO_SHARE = 1e-4
+"""Share of the linear model's decrease of the energy that a step must reach."""
+ENERGY_ROUNDING = 1e-15
+"""Increase of the energy that counts as rounding; a few units in the last place of float64 [energy]."""
+MIN_STEP_LENGTH = 1e-8
+"""Length at which backtracking gives up [Newton step]."""
 
 
 class Equilibrium(eqx.Module):
-    """What the search ended with."""
+    """Result of the search."""
 
     x: Float[Array, "n 3"]
-    """[m]."""
+    """Positions [m]."""
     force: Float[Array, ""]
     """Largest unbalanced force component [N]."""
     steps: Int[Array, ""]
+    """Number of Newton steps."""
     converged: Bool[Array, ""]
+    """Whether `force` is within the tolerance."""
 
 
 def equilibrium(
@@ -39,10 +49,17 @@ def equilibrium(
     force_tolerance: float | Array = 1e-8,
     max_steps: int = 200,
 ) -> Equilibrium:
-    """Minimise U(x; b) from `start` until no particle feels more than `force_tolerance` [N].
+    """Return the minimum of U(x; b) that a search from `start` reaches.
 
     Reverse and forward differentiable in every float of `energy` and in `b`; not in `start`, on which a minimum does
     not depend.
+
+    Args:
+        energy: U without the boundary springs.
+        b: stiffness of the boundary springs [N/m].
+        start: where the search begins [m].
+        force_tolerance: largest component of an unbalanced force at which the search has converged [N].
+        max_steps: largest number of Newton steps.
     """
     dynamic, static = eqx.partition(energy, eqx.is_inexact_array)
     x, force, steps = _search(dynamic, static, b, jax.lax.stop_gradient(start), force_tolerance, max_steps)
@@ -50,7 +67,7 @@ def equilibrium(
 
 
 def _search(dynamic, static, b, start, force_tolerance, max_steps):
-    """The implicitly differentiated search; see `equilibrium`."""
+    """Return x, the largest force and the number of steps, implicitly differentiable; see `equilibrium`."""
 
     @jax.custom_jvp
     def solution(dynamic, b, start):
@@ -71,7 +88,7 @@ def _search(dynamic, static, b, start, force_tolerance, max_steps):
 
 
 def _implicit_solve(energy, matrix, rhs):
-    """H^-1 rhs with a transpose rule, so that reverse mode goes through it."""
+    """Return H^-1 rhs, with a transpose rule for reverse mode."""
     layout = energy.layout
     return jax.lax.custom_linear_solve(
         lambda v: multiply(layout, matrix, v),
@@ -82,30 +99,32 @@ def _implicit_solve(energy, matrix, rhs):
 
 
 def _minimise(energy, b, start, force_tolerance, max_steps):
-    """Projected Newton with backtracking; returns x, the largest force, and the number of steps."""
+    """Return x, the largest force and the number of steps of projected Newton with backtracking."""
     layout = energy.layout
 
     def newton(state):
         x, value, gradient, count, _ = state
         matrix = energy.hessian(x, b, positive=True)
-        shift = 1e-9 * jnp.max(jnp.abs(matrix.diagonal))
+        shift = HESSIAN_SHIFT * jnp.max(jnp.abs(matrix.diagonal))
         matrix = add_to_diagonal(layout, matrix, jnp.broadcast_to(shift * jnp.eye(3), (len(x), 3, 3)))
         step = newton_step(layout, matrix, gradient)
         slope = jnp.sum(step * gradient)
 
         def too_far(trial):
             length, (new, _) = trial
-            return (~(new <= value + 1e-4 * length * slope + 1e-15 * jnp.abs(value))) & (length > 1e-8)
+            highest = value + ARMIJO_SHARE * length * slope + ENERGY_ROUNDING * jnp.abs(value)
+            return (~(new <= highest)) & (length > MIN_STEP_LENGTH)
 
         def halve(trial):
             length, _ = trial
             return length / 2, energy.value_and_gradient(x + length / 2 * step, b)
 
         untried = (2 * jnp.ones(()), (jnp.full_like(value, jnp.inf), gradient))
-        length, (new, pull) = jax.lax.while_loop(too_far, halve, untried)
-        stuck = length <= 1e-8
-        moved, new, pull = jax.tree.map(partial(jnp.where, stuck), (x, value, gradient), (x + length * step, new, pull))
-        return moved, new, pull, count + 1, stuck
+        length, (new, new_gradient) = jax.lax.while_loop(too_far, halve, untried)
+        stuck = length <= MIN_STEP_LENGTH
+        after = x + length * step, new, new_gradient
+        moved, new, new_gradient = jax.tree.map(partial(jnp.where, stuck), (x, value, gradient), after)
+        return moved, new, new_gradient, count + 1, stuck
 
     def unfinished(state):
         _, _, gradient, count, stuck = state
@@ -117,19 +136,21 @@ def _minimise(energy, b, start, force_tolerance, max_steps):
 
 
 def newton_step(layout: Layout, matrix: BlockTridiagonal, gradient: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """-A^-1 g; on a CPU from a factor in single precision, in two thirds of the time, if that leaves at most `ROUGH`.
+    """Return the Newton step -A^-1 g [m].
 
-    A GPU waits for each block however wide its numbers are, and a factor that was not enough is lost time.
+    On a CPU the factor is in single precision, which takes two thirds of the time, unless the step then misses
+    `MAX_LINEAR_RESIDUAL`. A GPU waits for each block at either precision, so there a second factor would only cost
+    time.
     """
 
     def exact(matrix, gradient):
         return -solve(layout, cholesky(matrix), gradient)
 
-    def rough_if_enough(matrix, gradient):
-        rough_matrix, rough_gradient = jax.tree.map(lambda part: part.astype(jnp.float32), (matrix, gradient))
-        rough = -solve(layout, cholesky(rough_matrix), rough_gradient).astype(gradient.dtype)
-        left = jnp.linalg.norm(multiply(layout, matrix, rough) + gradient)
-        enough = left <= ROUGH * jnp.linalg.norm(gradient)
-        return jax.lax.cond(enough, lambda: rough, lambda: exact(matrix, gradient))
+    def single_if_enough(matrix, gradient):
+        single = jax.tree.map(lambda part: part.astype(jnp.float32), (matrix, gradient))
+        step = -solve(layout, cholesky(single[0]), single[1]).astype(gradient.dtype)
+        residual = jnp.linalg.norm(multiply(layout, matrix, step) + gradient)
+        enough = residual <= MAX_LINEAR_RESIDUAL * jnp.linalg.norm(gradient)
+        return jax.lax.cond(enough, lambda: step, lambda: exact(matrix, gradient))
 
-    return jax.lax.platform_dependent(matrix, gradient, cpu=rough_if_enough, default=exact)
+    return jax.lax.platform_dependent(matrix, gradient, cpu=single_if_enough, default=exact)

@@ -1,6 +1,6 @@
 """The estimator's own mesh: triangles over rest positions, with the edges, hinges and areas that the energy needs.
 
-Built once from the first observation (or a declared mesh) in numpy; knows no stiffness and no forces.
+Built once from the first observation (or a declared mesh) in numpy; it has no stiffness and no forces.
 """
 
 from dataclasses import dataclass
@@ -24,24 +24,25 @@ class SheetMesh:
     rest: Float[np.ndarray, "n 3"]
     """Rest positions [m]."""
     faces: Int[np.ndarray, "f 3"]
+    """Particles of each triangle."""
 
     def __post_init__(self) -> None:
-        """Refuse what no energy can be written for."""
+        """Check that an energy can be written for the mesh."""
         check_mesh(self.rest, self.faces)
 
     @property
     def n(self) -> int:
-        """Number of particles."""
+        """Return the number of particles."""
         return len(self.rest)
 
     @cached_property
     def edges(self) -> Int[np.ndarray, "e 2"]:
-        """Each edge once, lower index first."""
+        """Return each edge once, lower index first."""
         return np.unique(np.sort(self._half_edges[:, :2], axis=1), axis=0)
 
     @cached_property
     def hinges(self) -> Int[np.ndarray, "h 4"]:
-        """Inner edges (first two vertices) with the two vertices opposite to them."""
+        """Return the inner edges (first two vertices) with the two vertices opposite to them."""
         half = self._half_edges
         half = np.column_stack([np.sort(half[:, :2], axis=1), half[:, 2]])
         half = half[np.lexsort(half.T[::-1])]
@@ -50,7 +51,7 @@ class SheetMesh:
 
     @cached_property
     def border(self) -> Bool[np.ndarray, " n"]:
-        """Particles on the sheet's edge."""
+        """Return which particles lie on the sheet's edge."""
         half = np.sort(self._half_edges[:, :2], axis=1)
         edges, faces = np.unique(half, axis=0, return_counts=True)
         on_edge = np.zeros(self.n, dtype=bool)
@@ -59,46 +60,46 @@ class SheetMesh:
 
     @cached_property
     def face_area(self) -> Float[np.ndarray, " f"]:
-        """[m^2]."""
+        """Return the area of each triangle [m^2]."""
         a, b, c = np.moveaxis(self.rest[self.faces], 1, 0)
         return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
     @cached_property
     def particle_area(self) -> Float[np.ndarray, " n"]:
-        """A third of each adjoining triangle [m^2]."""
+        """Return each particle's area: a third of every adjoining triangle [m^2]."""
         return np.bincount(self.faces.ravel(), np.repeat(self.face_area / 3, 3), minlength=self.n)
 
     @cached_property
     def spacing(self) -> float:
-        """Median edge length [m]."""
+        """Return the median edge length [m]."""
         return float(np.median(np.linalg.norm(self.rest[self.edges[:, 0]] - self.rest[self.edges[:, 1]], axis=1)))
 
     @cached_property
     def adjacency(self) -> sp.csr_matrix:
-        """Particles that share an edge or a hinge: the pattern of the energy's Hessian."""
+        """Return which particles share an edge or a hinge: the pattern of the energy's Hessian."""
         pairs = [self.hinges[:, [a, b]] for a in range(4) for b in range(a)]
         return pattern(self.n, np.concatenate([self.edges, *pairs]))
 
     @property
     def _half_edges(self) -> Int[np.ndarray, "h 3"]:
-        """Directed edges of every face with the opposite vertex."""
+        """Return the directed edges of every face with the opposite vertex."""
         f = self.faces
         return np.concatenate([f[:, [0, 1, 2]], f[:, [1, 2, 0]], f[:, [2, 0, 1]]])
 
 
 def pattern(n: int, pairs: Int[np.ndarray, "m 2"]) -> sp.csr_matrix:
-    """Symmetric n x n boolean pattern with the given pairs and the diagonal."""
+    """Return the symmetric n x n boolean pattern with the given pairs and the diagonal."""
     return symmetric(n, np.concatenate([pairs, np.repeat(np.arange(n)[:, None], 2, axis=1)]))
 
 
 def symmetric(n: int, pairs: Int[np.ndarray, "m 2"]) -> sp.csr_matrix:
-    """Symmetric n x n boolean pattern with the given pairs alone."""
+    """Return the symmetric n x n boolean pattern with the given pairs alone."""
     i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
     return sp.csr_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(n, n))
 
 
 def neighbour_table(near: sp.csr_matrix) -> Int[np.ndarray, "n p"]:
-    """Columns of each row of a pattern, in ascending order, padded with -1."""
+    """Return the columns of each row of a pattern, in ascending order, padded with -1."""
     near = near.sorted_indices()
     degree = np.diff(near.indptr)
     table = np.full((len(degree), degree.max()), -1)
@@ -108,12 +109,15 @@ def neighbour_table(near: sp.csr_matrix) -> Int[np.ndarray, "n p"]:
 
 
 def places_back(table: Int[np.ndarray, "n p"]) -> Int[np.ndarray, "n p"]:
-    """Place of a row in each row that it names in a symmetric `neighbour_table`; anything where it names none."""
+    """Return each particle's place in the rows of its neighbours, of a symmetric `neighbour_table`.
+
+    Entries for the padding have no meaning.
+    """
     return np.argmax(table[table] == np.arange(len(table))[:, None, None], axis=2)
 
 
 def far_apart(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " _count"]:
-    """Indices of points far from one another, each the farthest from those before; begins far from the middle."""
+    """Return indices of up to `count` points by farthest-point sampling, the first the one farthest from the mean."""
     chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
     nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
     while len(chosen) < min(count, len(points)):

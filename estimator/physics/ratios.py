@@ -1,7 +1,7 @@
-"""The sheet's own parameters that positions can tell: the weight and the bending stiffness relative to the membrane's.
+"""The sheet's parameters that positions identify: weight and bending stiffness relative to the membrane stiffness.
 
-Scaling every stiffness and every force by one factor moves nothing. So the membrane is the unit, and each of the others
-is a factor on what was declared.
+Scaling every stiffness and every force by one factor moves nothing. So the membrane stiffness is the unit, and each
+other parameter is a factor on its declared value.
 """
 
 import equinox as eqx
@@ -14,18 +14,18 @@ from .environment import BedContact, Weight
 
 
 def ratios(energy: SheetEnergy) -> tuple[str, ...]:
-    """Those that the sheet has at all; without gravity there is no weight."""
+    """Return the names of the ratios that the sheet has; without gravity it has no weight."""
     return ("weight", "bending") if any(isinstance(term, Weight) for term in energy.terms) else ("bending",)
 
 
 def scaled(energy: SheetEnergy, log_factor: Float[Array, " k"]) -> SheetEnergy:
-    """The energy with each of its `ratios` times a factor, given as its logarithm; differentiable.
+    """Return the energy with each of its `ratios` multiplied by a factor, given by its logarithm; differentiable.
 
-    The bed carries the new weight where it carried the old one.
+    The bed supports the new weight in the same shape in which it supported the old one.
     """
     factor = dict(zip(ratios(energy), jnp.exp(log_factor), strict=True))
 
-    def one(term: Term) -> Term:
+    def scale(term: Term) -> Term:
         if isinstance(term, Weight):
             return eqx.tree_at(lambda t: t.mass, term, factor["weight"] * term.mass)
         if isinstance(term, BedContact):
@@ -36,4 +36,4 @@ def scaled(energy: SheetEnergy, log_factor: Float[Array, " k"]) -> SheetEnergy:
             return eqx.tree_at(lambda t: (t.weight, t.curvature), term, (root * term.weight, root * term.curvature))
         return term
 
-    return eqx.tree_at(lambda e: e.terms, energy, tuple(one(term) for term in energy.terms))
+    return eqx.tree_at(lambda e: e.terms, energy, tuple(scale(term) for term in energy.terms))

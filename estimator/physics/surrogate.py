@@ -1,7 +1,7 @@
-"""The estimator's model of one sheet: its mesh and what the user declares, put together as an energy.
+"""The estimator's model of one sheet: an energy built from its mesh and the user's declaration.
 
-Everything that the declaration does not say (the bed's softness, the stiffness of a grip) scales with the declared
-membrane stiffness, because positions know only ratios.
+Every stiffness that the declaration does not give (of the bed, of a grip) scales with the declared membrane stiffness,
+because positions identify only ratios.
 """
 
 from typing import Literal
@@ -14,18 +14,22 @@ from .bending import IsometricBending
 from .block_tridiagonal import Layout
 from .energy import SheetEnergy, Term
 from .environment import BedContact, Weight
-from .hanging import Tension, as_it_hangs
+from .hanging import Tension, hanging_gravity
 from .membrane import EdgeMembrane, TriangleMembrane
 from .mesh import SheetMesh
 
 BED_STIFFNESS = 1 / 3
-"""Of the bed under one particle, as a share of the membrane stiffness."""
+"""Stiffness of the bed under one particle [membrane stiffness]."""
 
 Membrane = Literal["triangles", "edges"]
+"""Laws of the sheet's plane: St Venant-Kirchhoff triangles, or springs along the edges."""
 
 
 def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane = "triangles") -> SheetEnergy:
-    """Membrane, bending, weight, and bed or tension of a sheet; attachments and grip are added by who uses it."""
+    """Return the energy of a sheet: membrane, bending, weight, and bed or tension.
+
+    The caller adds attachments and grip.
+    """
     k, nu = declaration.membrane_stiffness, declaration.poisson
     plate = k * declaration.thickness**2 / (12 * (1 - nu**2))
     elastic = (
@@ -36,7 +40,7 @@ def surrogate(mesh: SheetMesh, declaration: Declaration, *, membrane: Membrane =
     terms: list[Term] = [elastic, IsometricBending.build(mesh, stiffness=plate)]
     gravity = np.asarray(declaration.gravity, dtype=float)
     if gravity.any():
-        down = as_it_hangs(mesh, gravity) if declaration.hangs else None
+        down = hanging_gravity(mesh, gravity) if declaration.hangs else None
         pull = tuple(gravity if down is None else down)
         weight = Weight.build(mesh.particle_area, areal_density=declaration.areal_density, gravity=pull)
         terms.append(weight)

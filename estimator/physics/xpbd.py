@@ -1,6 +1,6 @@
 """Extended position-based dynamics [Macklin et al. 2016, doi:10.1145/2994258.2994272]: the paper's simulator f.
 
-One step from x_t, with no velocity, looks for the minimum of
+One step from x_t, with no velocity, approaches the minimum of
 
     1/2 dt^-2 (x - x~)^T M (x - x~) + U(x; b),   x~ = x_t + dt^2 M^-1 f_external,
 
@@ -9,10 +9,10 @@ by sweeps of Gauss-Seidel over the constraints C = C_m + C_a + C_b, each with a 
     d_lambda = -(C + alpha~ lambda) / (grad C M^-1 grad C^T + alpha~),   alpha~ = 1 / (k dt^2),
     dx = M^-1 grad C^T d_lambda.
 
-Here numerator and denominator are multiplied by k dt^2, so that no stiffness is no constraint and nothing is divided
-by zero. Constraints of one colour share no particle and move at once. A few sweeps are the paper's f; a step that is
-swept to the end is one step of implicit Euler, but for springs that turn on the way; argmin U is what `settle` reaches
-in many steps and `equilibrium` directly.
+Here numerator and denominator are multiplied by k dt^2, so that zero stiffness means no constraint and no division by
+zero. Constraints of one colour share no particle and move at once. A few sweeps are the paper's f. A step that is
+swept until it converges is one step of implicit Euler, except for the rotation of the springs during the step. `settle`
+reaches argmin U in many steps, and `equilibrium` directly.
 """
 
 from collections.abc import Callable
@@ -28,6 +28,7 @@ from .membrane import EdgeMembrane
 from .mesh import SheetMesh
 
 Residual = Callable[[Float[Array, "n 3"]], Float[Array, "n 3"]]
+"""Displacement that is added to the particles at given positions [m]."""
 
 
 class XPBD(eqx.Module):
@@ -36,13 +37,13 @@ class XPBD(eqx.Module):
     rest: Float[Array, "n 3"]
     """Anchors of the boundary springs [m]."""
     batches: tuple[EdgeMembrane, ...]
-    """C_m: edges and hinges, by colour."""
+    """Springs C_m on edges and across hinges, by colour."""
     inverse_mass: Float[Array, " n"]
-    """[1/kg]."""
+    """Inverse mass of each particle [1/kg]."""
     force: Float[Array, "n 3"]
     """External force on each particle [N]; the paper has none."""
     time_step: Float[Array, ""]
-    """dt [s]."""
+    """Time step dt [s]."""
 
     @classmethod
     def build(
@@ -54,14 +55,14 @@ class XPBD(eqx.Module):
         time_step: float,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> "XPBD":
-        """Colour the springs of a mesh.
+        """Build the simulator of a mesh, with its springs in colours.
 
         Args:
             mesh: the sheet.
             springs: its C_m, for example `EdgeMembrane.build` and `hinge_springs`.
             areal_density: mass per area [kg/m^2].
             time_step: dt [s].
-            gravity: [m/s^2].
+            gravity: acceleration [m/s^2].
         """
         mass = areal_density * mesh.particle_area
         batches = tuple(
@@ -90,46 +91,46 @@ class XPBD(eqx.Module):
         sweeps: int,
         residual: Residual | None = None,
     ) -> Float[Array, "n 3"]:
-        """f(x_t, u, b): one step from x_t, differentiable by unrolling in all but `sweeps`.
+        """Return f(x_t, u, b) [m], one step from x_t, differentiable by unrolling in all arguments but `sweeps`.
 
         Args:
             x: x_t [m].
             b: stiffness of the boundary springs [N/m].
             grip: C_a with the tip at u; None for open jaws.
-            sweeps: of Gauss-Seidel.
-            residual: moves the particles once a sweep beside the constraints: the paper's f', matched to a cloud.
+            sweeps: number of Gauss-Seidel sweeps.
+            residual: displacement to add before the constraints of each sweep: the paper's f', matched to a cloud.
         """
-        return self._sweeps(self._fall(x), self._slack(x), b, grip, sweeps, residual)[0]
+        return self._sweeps(self._fall(x), self._zero_multipliers(x), b, grip, sweeps, residual)[0]
 
     def settle(
         self, x: Float[Array, "n 3"], b: Float[Array, " n"], grip: Grip | None = None, *, sweeps: int, steps: int
     ) -> Float[Array, "n 3"]:
-        """Towards argmin U: steps that each begin with the multipliers that the one before ended with.
+        """Return positions near argmin U [m], by steps that each begin with the multipliers of the step before.
 
-        Steps whose multipliers begin at zero, as in `step`, come to rest elsewhere, because the springs turn between
-        the fall and the sweeps that undo it. Here whatever does not move has grad U = 0. Stable while k dt^2 / m stays
+        Steps whose multipliers begin at zero, as in `step`, come to rest elsewhere, because the springs rotate between
+        the fall and the sweeps that undo it. Here a state that does not move has grad U = 0. Stable while k dt^2 / m is
         below about 0.2 for the stiffest spring, so this takes thousands of short steps; it is for checking.
         """
 
-        def one(state, _):
+        def advance(state, _):
             x, multipliers = state
             return self._sweeps(
-                self._transferred(self._fall(x), x, multipliers, grip), multipliers, b, grip, sweeps
+                self._with_impulses(self._fall(x), x, multipliers, grip), multipliers, b, grip, sweeps
             ), None
 
-        return jax.lax.scan(one, (x, self._slack(x)), length=steps)[0][0]
+        return jax.lax.scan(advance, (x, self._zero_multipliers(x)), length=steps)[0][0]
 
     def _fall(self, x):
-        """x~, where a step without constraints ends."""
+        """Return x~ [m], the end of a step without constraints."""
         return x + self.time_step**2 * self.inverse_mass[:, None] * self.force
 
-    def _slack(self, x):
-        """Multipliers of zero: of the mesh's batches, the grip and the boundary springs."""
+    def _zero_multipliers(self, x):
+        """Return zero multipliers for the mesh's batches, the grip and the boundary springs."""
         of_mesh = tuple(jnp.zeros(len(batch.length), x.dtype) for batch in self.batches)
         return of_mesh, jnp.zeros(len(x), x.dtype), jnp.zeros_like(x)
 
-    def _transferred(self, start, x, multipliers, grip):
-        """`start` moved by M^-1 grad C(x)^T lambda."""
+    def _with_impulses(self, start, x, multipliers, grip):
+        """Return `start` moved by M^-1 grad C(x)^T lambda [m]."""
         of_mesh, of_grip, of_boundary = multipliers
         w = self.inverse_mass[:, None]
         impulse = of_boundary
@@ -142,17 +143,17 @@ class XPBD(eqx.Module):
         return start + w * impulse
 
     def _sweeps(self, start, multipliers, b, grip, number: int, residual: Residual | None = None):
-        """A number of sweeps, and the multipliers that they leave."""
+        """Return positions and multipliers after a number of sweeps."""
 
-        def one(state, _):
+        def advance(state, _):
             x, multipliers = state
             x = x if residual is None else x + residual(x)
             return self._sweep(x, multipliers, b, grip), None
 
-        return jax.lax.scan(one, (start, multipliers), length=number)[0]
+        return jax.lax.scan(advance, (start, multipliers), length=number)[0]
 
     def _sweep(self, x, multipliers, b, grip):
-        """All constraints once: C_m colour by colour, then C_a, then C_b."""
+        """Apply all constraints once: C_m colour by colour, then C_a, then C_b."""
         of_mesh, of_grip, of_boundary = multipliers
         moved = []
         for batch, multiplier in zip(self.batches, of_mesh, strict=True):
@@ -164,7 +165,7 @@ class XPBD(eqx.Module):
         return x, (tuple(moved), of_grip, of_boundary)
 
     def _stretch(self, x, multiplier, batch: EdgeMembrane):
-        """C = |x_1 - x_0| - l."""
+        """Apply C = |x_1 - x_0| - l."""
         i, j = batch.vertices.T
         direction, distance = _direction(x[j] - x[i])
         w_i, w_j = self.inverse_mass[i], self.inverse_mass[j]
@@ -174,27 +175,27 @@ class XPBD(eqx.Module):
         return x, multiplier + change
 
     def _hold(self, x, multiplier, grip: Grip):
-        """C_a = |x_j - u| - r_j."""
+        """Apply C_a = |x_j - u| - r_j."""
         direction, distance = _direction(x - grip.tip[None])
         change = self._change(distance - grip.length, multiplier, self.inverse_mass, grip.stiffness)
         return x + (self.inverse_mass * change)[:, None] * direction, multiplier + change
 
     def _anchor(self, x, multiplier, b):
-        """C_b = x_i - a_i, a vector: the paper's |x_i - a_i| has no gradient where every attachment starts."""
+        """Apply the vector C_b = x_i - a_i: the paper's |x_i - a_i| has no gradient at x_i = a_i, where it starts."""
         change = self._change(x - self.rest, multiplier, self.inverse_mass[:, None], b[:, None])
         return x + self.inverse_mass[:, None] * change, multiplier + change
 
     def _change(self, constraint, multiplier, inverse_mass, stiffness):
-        """d_lambda for constraints of unit gradient."""
+        """Return d_lambda of constraints with a unit gradient."""
         scaled = stiffness * self.time_step**2
         return -(scaled * constraint + multiplier) / (scaled * inverse_mass + 1)
 
 
 def hinge_springs(mesh: SheetMesh, *, stiffness: float) -> EdgeMembrane:
-    """Bending between neighbouring faces as a distance, of the two corners opposite to their edge.
+    """Return bending springs between the two corners opposite to each inner edge.
 
     The paper asks for "bending constraints between neighboring mesh faces" and says that all its constraints are
-    distances between particles; this is the one that is both. `stiffness` [N/m] is that of each spring.
+    distances between particles; this constraint is both. `stiffness` [N/m] is that of each spring.
     """
     pairs = mesh.hinges[:, 2:]
     length = np.linalg.norm(mesh.rest[pairs[:, 1]] - mesh.rest[pairs[:, 0]], axis=1)
@@ -204,7 +205,7 @@ def hinge_springs(mesh: SheetMesh, *, stiffness: float) -> EdgeMembrane:
 
 
 def colours(pairs: Int[np.ndarray, "m 2"], n: int) -> list[Int[np.ndarray, " _k"]]:
-    """Groups of pairs that share no particle, each pair in the first group that has room for it."""
+    """Return groups of pairs that share no particle: greedy colouring, each pair in the first group that is free."""
     taken: list[set[int]] = [set() for _ in range(n)]
     groups: list[list[int]] = []
     for number, (i, j) in enumerate(pairs.tolist()):
@@ -218,6 +219,6 @@ def colours(pairs: Int[np.ndarray, "m 2"], n: int) -> list[Int[np.ndarray, " _k"
 
 
 def _direction(d: Float[Array, "m 3"]) -> tuple[Float[Array, "m 3"], Float[Array, " m"]]:
-    """Unit vector and length."""
+    """Return unit vectors and lengths [m]."""
     distance = lengths(d)
     return d / distance[:, None], distance

@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..filters.shots import SWEEPS, slopes
+from ..filters.shots import slopes
 from ..physics.environment import Grip
+from ..physics.simulator import SWEEPS_PER_STEP
 from ..physics.xpbd import XPBD
 from .objectives import boundary_energy, log_shrinkage, outside, uncertainty_weighted_displacement
 
@@ -103,7 +104,7 @@ def entropy_loss(simulator: XPBD, situation: Situation, scales: Scales) -> Loss:
 def ahead(simulator: XPBD, situation: Situation, tip: Float[Array, " 3"], b: Float[Array, " n"]) -> Float[Array, "n 3"]:
     """f(x_t, a, b), the state one step ahead [m]."""
     grip = Grip.of(tip, situation.length, situation.stiffness)
-    return simulator.step(situation.x, b, grip, sweeps=SWEEPS)
+    return simulator.step(situation.x, b, grip, sweeps=SWEEPS_PER_STEP)
 
 
 def _risk(

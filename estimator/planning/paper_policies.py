@@ -19,8 +19,8 @@ from jiggle_mj.limits import Limits
 
 from ..blas import one_thread
 from ..estimator import Estimator
-from ..filters.shots import simulator
 from ..physics.mesh import SheetMesh
+from ..physics.simulator import simulator
 from ..physics.xpbd import XPBD
 from .controllers import (
     PRIMITIVES,

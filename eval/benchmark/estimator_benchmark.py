@@ -23,11 +23,11 @@ from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.filters.evidence import Evidence, Pull
 from jiggle_mj.estimator.filters.filter import Filter
-from jiggle_mj.estimator.filters.shots import simulator
 from jiggle_mj.estimator.physics.energy import SheetEnergy
 from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.equilibrium import equilibrium
 from jiggle_mj.estimator.physics.mesh import SheetMesh
+from jiggle_mj.estimator.physics.simulator import simulator
 from jiggle_mj.estimator.physics.surrogate import surrogate
 from jiggle_mj.estimator.planning.controllers import Scales, Situation, displacement_loss, large_step
 from jiggle_mj.observation import Declaration

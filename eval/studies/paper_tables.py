@@ -13,7 +13,8 @@ from typing import Literal
 
 from jiggle_mj.episode import ESTIMATE, RESULT, check_directory, clear_directory, estimate
 from jiggle_mj.estimator import Estimator, EstimatorConfig
-from jiggle_mj.estimator.filters import adam, shots, unscented
+from jiggle_mj.estimator.filters import adam, unscented
+from jiggle_mj.estimator.physics.simulator import HINGE_STIFFNESS, SWEEPS_PER_STEP, TIME_STEP
 from jiggle_mj.scenes import Scene, load_scene
 from jiggle_mj.scenes.scene.programme import grasp_points
 
@@ -217,8 +218,8 @@ def settings_in_words(table: PaperTable, seeds: list[str]) -> str:
             f"mujoco: the scene as shipped, b* = {' or '.join(f'{share:.3g}' for share in sorted(shipped))} k.",
             f"Attached: above {RULE:g} b*. Prior sd {common.prior_sd:.3g} k, force sd {common.force_sd:g} k x spacing,",
             f"but {OWN_FORCE_SD:g} for ours where the truth is an equilibrium of the same energy,",
-            f"{common.samples} sample a frame. f: dt = {shots.TIME_STEP:g} s, {shots.SWEEPS} sweeps,",
-            f"hinges {shots.HINGE:.3g} k. Adam: rate {adam.RATE:g} k, {adam.ADAM_STEPS} steps a frame.",
+            f"{common.samples} sample a frame. f: dt = {TIME_STEP:g} s, {SWEEPS_PER_STEP} sweeps,",
+            f"hinges {HINGE_STIFFNESS:.3g} k. Adam: rate {adam.RATE:g} k, {adam.ADAM_STEPS} steps a frame.",
             f"{unscented.PATCHES} patches. Ours: attached where P > 0.5, with P / (1 - P) beforehand of",
             f"{common.prior.probability / (1 - common.prior.probability):.3g} times e^{common.prior.coupling:g}",
             f"for each attached neighbour, and b / (b + k) from {common.prior.components[0]:g} up where attached.",

@@ -23,11 +23,11 @@ from jaxtyping import Bool, Float
 from jiggle_mj.actions import Action, Grasp, Move, Release
 from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.estimator.blas import one_thread
-from jiggle_mj.estimator.filters.shots import SWEEPS, simulator
 from jiggle_mj.estimator.physics.energy import SheetEnergy
 from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.equilibrium import equilibrium
 from jiggle_mj.estimator.physics.mesh import SheetMesh
+from jiggle_mj.estimator.physics.simulator import SWEEPS_PER_STEP, simulator
 from jiggle_mj.estimator.physics.surrogate import surrogate
 from jiggle_mj.observation import Declaration, DeclaredMesh, MeasuredPoints, Observation, ToolState
 from jiggle_mj.scenes import Scene, programme
@@ -152,7 +152,7 @@ def _carried_out(actions: Iterator[Action], mesh: SheetMesh, declaration: Declar
 def _xpbd(mesh: SheetMesh, declaration: Declaration, b):
     """The explicit filter's f."""
     f = eqx.filter_jit(simulator(mesh, declaration).step)
-    return lambda x, grip: np.asarray(f(jnp.asarray(x), b, grip, sweeps=SWEEPS))
+    return lambda x, grip: np.asarray(f(jnp.asarray(x), b, grip, sweeps=SWEEPS_PER_STEP))
 
 
 def _equilibrium(mesh: SheetMesh, declaration: Declaration, b):

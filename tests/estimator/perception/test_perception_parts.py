@@ -9,6 +9,7 @@ import pytest
 from jiggle_mj.camera import CameraCalibration
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimator.perception import SemiGlobalMatching, WarmTissue
+from jiggle_mj.estimator.perception.config import RegistrationConfig, SheetMeshConfig
 from jiggle_mj.estimator.perception.lucas_kanade import normalise, step_in_plane
 from jiggle_mj.estimator.perception.material_map import MaterialMap
 from jiggle_mj.estimator.perception.mesh_field import MeshField
@@ -18,21 +19,27 @@ from jiggle_mj.estimator.perception.resampling import double, sample_doubled
 from jiggle_mj.estimator.perception.sheet_mesh import DisparitySurface, lay_mesh
 from jiggle_mj.estimator.perception.tissue_mask import largest_blob
 from jiggle_mj.observation import StereoPair
-from tests.support.perception_plane import BASELINE, FOCAL, HALF, HEIGHT, WIDTH, PlaneSheet, camera, draw, stereo
+from tests.support.perception_plane import (
+    BASELINE,
+    DISTANCE,
+    FOCAL,
+    HALF,
+    HEIGHT,
+    WIDTH,
+    PlaneSheet,
+    camera,
+    draw,
+    stereo,
+)
 
 SPACING = 4e-3
 TILTED = PlaneSheet(centre=np.array([0.001, 0, 0.012]), across=np.array([0, 0.97, 0.25]))
 """A sheet whose disparity varies by several pixels over the image."""
 
 
-def true_disparity(points):
-    """f B / Z by hand."""
-    return FOCAL * BASELINE / (0.11 - points[:, 2])
-
-
 @pytest.fixture(scope="module")
 def flat():
-    """The flat sheet's pair, tissue and mesh."""
+    """Return the flat sheet's pair, tissue and mesh."""
     pair = stereo(PlaneSheet())
     tissue = largest_blob(WarmTissue()(pair.left), smallest=100)
     mesh = lay_mesh(tissue, SemiGlobalMatching(largest=64)(pair.left, pair.right), camera(), spacing=SPACING)
@@ -41,7 +48,7 @@ def flat():
 
 @pytest.fixture(scope="module")
 def fields(flat):
-    """Material map and mesh field over the flat sheet's mesh."""
+    """Return the material map and the mesh field of the flat sheet."""
     _, tissue, mesh = flat
     return MaterialMap(mesh.uvd[:, :2], mesh.faces, tissue), MeshField(mesh.uvd[:, :2], mesh.faces)
 
@@ -50,7 +57,7 @@ def test_the_mask_is_the_sheet_without_bed_and_tool():
     """The square's projection, one pixel along its outline left open; a grey rod over it is left out."""
     image = draw((PlaneSheet(),), shift=0.0)
     image[140:160, 150:] = 120
-    side = 2 * HALF * FOCAL / 0.11
+    side = 2 * HALF * FOCAL / DISTANCE
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     inside = (abs(u - (WIDTH - 1) / 2) < side / 2) & (abs(v - (HEIGHT - 1) / 2) < side / 2)
     inside[140:160, 150:] = False
@@ -61,7 +68,7 @@ def test_the_mask_is_the_sheet_without_bed_and_tool():
 
 
 def test_a_grey_image_has_no_tissue():
-    """Otsu splits anything; the least redness keeps grey out."""
+    """Otsu's threshold splits any image; the smallest redness excludes grey."""
     grey = np.repeat(np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 1), dtype=np.uint8), 3, axis=2)
     assert not WarmTissue()(grey).any()
 
@@ -78,19 +85,24 @@ def test_the_largest_blob_drops_flecks_and_refuses_a_second_sheet():
 
 
 def test_semi_global_matching_finds_the_plane_and_nothing_in_swapped_images():
-    """d = f B / Z within 0.3 px (it locks to whole pixels); swapped, under 20 % pass, which `start` refuses."""
+    """d = f B / Z within 0.2 px, as it locks to whole pixels; swapped, fewer pass than a sheet needs.
+
+    Measured: a median error of 0.15 px, all pixels matched; swapped, 19 %.
+    """
     pair = stereo(TILTED)
     disparity = SemiGlobalMatching(largest=64)(pair.left, pair.right)
     tissue = WarmTissue()(pair.left)
     v, u = np.nonzero(tissue & np.isfinite(disparity))
-    assert len(u) > 0.9 * tissue.sum()
+    assert len(u) > 0.99 * tissue.sum()
     points = camera().back_project(np.stack([u, v, disparity[v, u]], axis=-1).astype(float))
     off_plane = (points - TILTED.centre) @ np.cross(TILTED.along, TILTED.across)
-    assert np.median(np.abs(off_plane)) < 0.3 * 0.1**2 / (FOCAL * BASELINE)
-    assert np.isfinite(SemiGlobalMatching(largest=64)(pair.right, pair.left)[tissue]).mean() < 0.2
+    assert np.median(np.abs(off_plane)) < 0.2 * 0.1**2 / (FOCAL * BASELINE)  # 0.1 m: the tilted sheet's distance
+    assert (
+        np.isfinite(SemiGlobalMatching(largest=64)(pair.right, pair.left)[tissue]).mean() < SheetMeshConfig.min_matched
+    )
 
 
-def test_triangles_that_hang_together_by_nothing_are_refused(flat):
+def test_triangles_in_two_pieces_are_refused(flat):
     """The contour is one piece, but its neck is one particle wide: triangles on both sides, none across."""
     _, tissue, _ = flat
     neck = tissue.copy()
@@ -110,10 +122,10 @@ def test_the_search_range_follows_from_the_calibration():
 
 
 def test_the_mesh_covers_the_sheet_with_good_triangles(flat):
-    """As many particles as the area over that of one, sqrt(3)/2 spacing^2, within 15 %; no angle under 18 degrees."""
+    """As many particles as the area over that of one, sqrt(3)/2 spacing^2, and 6 % more on the border."""
     _, _, mesh = flat
     expected = (2 * HALF) ** 2 / (np.sqrt(3) / 2 * SPACING**2)
-    assert abs(len(mesh.rest) / expected - 1) < 0.15
+    assert 1 < len(mesh.rest) / expected < 1.1
     assert np.sort(np.unique(mesh.faces)).tolist() == list(range(len(mesh.rest)))
     corner = mesh.rest[mesh.faces]
     edge = np.roll(corner, -1, axis=1) - corner
@@ -121,12 +133,16 @@ def test_the_mesh_covers_the_sheet_with_good_triangles(flat):
     cosine = -np.einsum("fkd,fkd->fk", edge, np.roll(edge, 1, axis=1)) / (length * np.roll(length, 1, axis=1))
     assert np.degrees(np.arccos(cosine)).min() > 17  # 18 in the fitted plane, before the surface's own tilt
     assert (np.cross(edge[:, 0], edge[:, 1])[:, 2] > 0).all()  # counter-clockwise as seen from the camera above
-    assert np.abs(mesh.rest[:, :2]).max() > HALF - 0.6 * SPACING
-    assert np.abs(mesh.rest[:, :2]).max() < HALF
+    inset = SheetMeshConfig.inset * SPACING
+    pixel = DISTANCE / FOCAL
+    assert np.abs(mesh.rest[:, :2]).max() == pytest.approx(HALF - inset, abs=pixel)
 
 
 def test_a_plane_is_fitted_with_degree_one_in_spite_of_outliers():
-    """The disparity of a plane is affine in the pixel; a tenth of gross mismatches does not move it by 0.01 px."""
+    """The disparity of a plane is affine in the pixel; a tenth of gross mismatches moves it by 0.002 px.
+
+    That is the noise of 0.05 px / sqrt(2000 / 3) of an affine fit without mismatches.
+    """
     rng = np.random.default_rng(0)
     pixels = rng.uniform(0, 300, (2000, 2))
     truth = 15 + pixels @ (0.01, -0.02)
@@ -134,7 +150,7 @@ def test_a_plane_is_fitted_with_degree_one_in_spite_of_outliers():
     measured[::10] += 8
     surface = DisparitySurface(pixels, measured)
     assert surface.degree == 1
-    assert np.abs(surface(pixels)[:, 2] - truth).max() < 0.01
+    assert np.abs(surface(pixels)[:, 2] - truth).max() < 0.004  # twice that
 
 
 def test_too_little_disparity_is_refused():
@@ -150,7 +166,7 @@ def test_a_sheet_of_few_particles_is_refused(flat):
 
 
 def test_two_blobs_joined_by_a_thread_are_refused(flat):
-    """The mask is one piece, the triangles are not."""
+    """The mask is one piece, the contour inside it is not."""
     _, tissue, _ = flat
     cut = tissue.copy()
     cut[:, 170:230] = False
@@ -181,19 +197,24 @@ def test_fill_and_derivative_are_exact_for_linear_fields(fields):
     middle = int(np.argmin(np.linalg.norm(material.at - material.at.mean(axis=0), axis=1)))
     known[middle] = False
     filled = field.fill(values, known, stiffness=1e-3)
-    edge = 1.2 * SPACING * FOCAL / 0.11  # by how much neighbours differ
-    assert np.linalg.norm(filled[middle] - values[middle]) < 0.02 * edge  # the lattice is regular to about 1 %
+    edge = 1.2 * SPACING * FOCAL / DISTANCE  # by how much neighbours differ
+    assert np.linalg.norm(filled[middle] - values[middle]) < 0.015 * edge  # the lattice is regular to about 1 %
 
 
 def test_a_mistaken_particle_is_off_its_neighbours_trend(fields):
-    """Under any linear motion all are on trend; one displaced by 5 px stands out by about 5 px."""
+    """Under any linear motion all are on trend; one that is displaced by 5 px is off by 5 (1 - 1/3) px.
+
+    Least squares over a hexagon of neighbours take 1/3 of the displacement for a derivative.
+    """
     material, field = fields
     values = material.at @ np.array([[0.8, 0.3], [-0.3, 1.1]])
     known = np.ones(len(values), bool)
     assert field.off_trend(values, known).max() < 1e-9
     middle = int(np.argmin(np.linalg.norm(material.at - material.at.mean(axis=0), axis=1)))
     values[middle] += (3, 4)
-    assert field.off_trend(values, known)[middle] == pytest.approx(5, abs=2)
+    assert field.off_trend(values, known)[middle] == pytest.approx(
+        5 * (1 - 1 / 3), rel=0.01
+    )  # the lattice is regular to about 1 %
     assert np.argmax(field.off_trend(values, known)) == middle
 
 
@@ -208,44 +229,47 @@ def test_resampling_is_exact_for_polynomials_between_pixels():
 
 
 def test_one_step_finds_a_small_shift(flat, fields):
-    """After one step a quarter of a shift by (0.3, -0.2) px is left at most.
+    """After one step at most a tenth of a shift by (0.3, -0.2) px remains.
 
-    Central differences see sin(w)/w of the slope of a wave of w rad/px, 0.84 at 1 rad/px: a step is 1/0.84 too long.
+    Central differences return sin(w)/w of the derivative of a wave of w rad/px, 0.92 at 0.7 rad/px: a step is 8 % long.
     """
     pair, _, _ = flat
     material, _ = fields
     grey = cv2.GaussianBlur(cv2.cvtColor(pair.left, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     moved = sample_doubled(double(grey), u - np.float32(0.3), v + np.float32(0.2))
-    images = [normalise(image[material.region], material.support, width=27) for image in (grey, moved)]
-    step = step_in_plane(*images, material, window=4.0)
-    assert (np.abs(np.median(step.shift, axis=0) - (0.3, -0.2)) < 0.25 * np.array([0.3, 0.2])).all()
+    config = RegistrationConfig()
+    images = [normalise(image[material.region], material.support, config) for image in (grey, moved)]
+    step = step_in_plane(*images, material, window=config.fine_window, config=config)
+    assert (np.abs(np.median(step.shift, axis=0) - (0.3, -0.2)) < 0.1 * np.array([0.3, 0.2])).all()
 
 
 def test_registration_recovers_a_homography(flat, fields):
-    """A tilted, stretched sheet, started 1.5 px off: inner particles within 0.15 px (noise of one grey level)."""
+    """A tilted, stretched sheet, started 1.5 px off, with noise of one grey level.
+
+    Inner particles have RMS errors of 0.041 px in the image and of 0.023 px in disparity.
+    """
     _, _, mesh = flat
     material, field = fields
     sheet = PlaneSheet(centre=np.array([0, 0, 0.006]), along=np.array([1.04, 0, 0.1]))
     now, rectify = stereo(sheet, seed=1), Rectifier(camera())
     first, second = rectify(stereo(PlaneSheet())), rectify(now)
     flat_rest = mesh.rest * (1, 1, 0)
-    truth = camera().project(sheet.carry(flat_rest))
+    truth = camera().project(sheet.deformed(flat_rest))
     start = truth[:, :2] + 1.5 * np.array([0.8, -0.6])
     registration = MaterialRegistration(first.left_grey, material, field)
     found = registration.refine(second.left_fine, WarmTissue()(now.left), start, windows=(8.0, 4.0, 4.0, 4.0))
     inner = np.abs(mesh.rest[:, :2]).max(axis=1) < 0.8 * HALF
-    identity = camera().project(flat_rest)[:, :2] - mesh.uvd[:, :2]  # how far the mesh's own depth is off at rest
+    identity = camera().project(flat_rest)[:, :2] - mesh.uvd[:, :2]  # error of the mesh's own depth at rest
     error = np.linalg.norm(found.value - truth[:, :2] + identity, axis=1)[inner]
-    assert np.sqrt(np.mean(error**2)) < 0.15
-    assert found.match.correlation[inner].min() > 0.9
+    assert np.sqrt(np.mean(error**2)) < 0.06
+    assert found.match.correlation[inner].min() > 0.99
 
     masks = WarmTissue()(now.left), WarmTissue()(now.right)
     level = np.full(len(truth), truth[:, 2].mean())
     fine = second.left_fine, second.right_fine
     depth = refine_disparity(*fine, masks, found.value, level, material, field)
-    whole_pixel_locking = 0.18
-    assert np.sqrt(np.mean((depth.value[inner, 0] - truth[inner, 2]) ** 2)) < whole_pixel_locking / 2
+    assert np.sqrt(np.mean((depth.value[inner, 0] - truth[inner, 2]) ** 2)) < 0.03
 
 
 def test_rectifying_undoes_distortion_and_rotation():

@@ -1,20 +1,35 @@
-"""The tracker as a whole, on a plane sheet whose every material point is known."""
+"""The stereo tracker from images to particles, on a plane sheet whose every material point is known."""
 
 import numpy as np
 import pytest
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimator.perception import StereoTracker
-from jiggle_mj.estimator.perception.stereo_tracker import DISPARITY_SD
+from jiggle_mj.estimator.perception.config import StereoTrackerConfig
 from jiggle_mj.observation import StereoPair
-from tests.support.perception_plane import BASELINE, FOCAL, HALF, HEIGHT, WIDTH, PlaneSheet, camera, stereo, tool
+from tests.support.perception_plane import (
+    BASELINE,
+    DISTANCE,
+    FOCAL,
+    HALF,
+    HEIGHT,
+    WIDTH,
+    PlaneSheet,
+    camera,
+    stereo,
+    tool,
+)
 
 SPACING = 4e-3
+ALL_BUT_ONE_PERCENT = 0.99
+"""Least share of unhidden particles that are seen; all are in the measured runs."""
+MAX_RMS = 2.5e-4
+"""Bound on the 3-D RMS error [m]: 0.04 px of disparity at Z^2 / (f B) = 5.8 mm per pixel. Measured 0.14 to 0.17 mm."""
 BLACK = StereoPair(left=np.zeros((HEIGHT, WIDTH, 3), np.uint8), right=np.zeros((HEIGHT, WIDTH, 3), np.uint8))
 
 
 def lifted(amount):
-    """A lift about the sheet's left edge by `amount` [m] at the right, with some shift and stretch."""
+    """Return the sheet lifted about its left edge by `amount` [m] at the right, with some shift and stretch."""
     slope = amount / (2 * HALF)
     return PlaneSheet(
         centre=np.array([-0.3 * amount, 0.1 * amount, amount / 2]),
@@ -24,6 +39,7 @@ def lifted(amount):
 
 
 def started():
+    """Return a tracker after the first pair, and its sheet."""
     tracker = StereoTracker(camera(), spacing=SPACING)
     return tracker, tracker.start(stereo(PlaneSheet()), tool())
 
@@ -32,48 +48,51 @@ def started():
 def lift():
     """Tracks and truths of a lift in eight steps, and the rest positions."""
     tracker, sheet = started()
-    believed, frames = sheet.rest, []
+    predicted, frames = sheet.rest, []
     for k in range(9):
         now = lifted(2e-3 * k)
-        track = tracker.track(stereo(now, seed=k + 1), tool(grasp=1, closed=True, z=2e-3 * k), predicted=believed)
-        frames.append((track, now.carry(sheet.rest)))
-        believed = np.where(track.visible[:, None], track.positions, believed)
+        track = tracker.track(stereo(now, seed=k + 1), tool(grasp=1, closed=True, z=2e-3 * k), predicted=predicted)
+        frames.append((track, now.deformed(sheet.rest)))
+        predicted = np.where(track.visible[:, None], track.positions, predicted)
     return sheet.rest, frames
 
 
 def test_rest_lies_on_the_plane():
-    """z = 0 within what the stated error of a perfect match makes of depth, Z^2 / (f B) per pixel of disparity."""
+    """z = 0 within the depth error of a perfect match: Z^2 / (f B) per pixel of disparity."""
     _, sheet = started()
-    assert np.abs(sheet.rest[:, 2]).max() < DISPARITY_SD * 0.11**2 / (FOCAL * BASELINE)
+    assert np.abs(sheet.rest[:, 2]).max() < StereoTrackerConfig.disparity_sd * DISTANCE**2 / (FOCAL * BASELINE)
 
 
-def test_a_lift_is_followed_without_drift(lift):
-    """Total 3-D RMS error of the seen particles under 0.6 mm in every frame, at least 90 % of them seen."""
+def test_a_lift_is_tracked_without_drift(lift):
+    """The 3-D RMS error of the seen particles is as small in the last frame as in the first."""
     _, frames = lift
     for track, truth in frames:
-        assert track.visible.mean() > 0.9
+        assert track.visible.mean() > ALL_BUT_ONE_PERCENT
         error = (track.positions - truth)[track.visible]
-        assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.6e-3
+        assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < MAX_RMS
 
 
 def test_the_covariance_is_honest(lift):
-    """Mean normalised squared error e' C^-1 e / 3 between 0.2 and 2: this texture is kinder than tissue's,
-    for which the covariance is widened."""
+    """The normalised squared error e' C^-1 e / 3 is near its value here, 0.26.
+
+    It is below 1 because variances are inflated by 2.2 for errors that persist from frame to frame, and because this
+    texture matches better than tissue's, for which the covariance was set.
+    """
     _, frames = lift
     nees = []
     for track, truth in frames:
         seen = track.visible
         error = (track.positions - truth)[seen]
         nees.append(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(track.covariance[seen]), error)) / 3)
-    assert 0.2 < np.mean(nees) < 2
+    assert 0.2 < np.mean(nees) < 0.35  # 9 frames of 191 particles; single frames range from 0.24 to 0.30
 
 
-def test_positions_and_pixels_say_the_same(lift):
-    """Positions are the back-projected uvd; NaN exactly where unseen, with the variance of the unknown."""
+def test_positions_are_the_back_projected_pixels(lift):
+    """Exactly; they are NaN where unseen, and nowhere else."""
     _, frames = lift
     track, _ = frames[-1]
     seen = track.visible
-    assert np.allclose(camera().back_project(track.uvd)[seen], track.positions[seen])
+    np.testing.assert_array_equal(camera().back_project(track.uvd)[seen], track.positions[seen])
     assert (np.isnan(track.positions).all(axis=1) == ~seen).all()
     assert (np.linalg.eigvalsh(track.covariance) > 0).all()
 
@@ -86,26 +105,26 @@ def test_what_the_tool_hides_is_not_seen():
     for image in (covered.left, covered.right):
         image[140:165] = 110 + np.arange(WIDTH)[:, None] % 7
     track = tracker.track(covered, tool(), predicted=sheet.rest)
-    truth = lifted(2e-3).carry(sheet.rest)
+    truth = lifted(2e-3).deformed(sheet.rest)
     row = camera().project(truth)[:, 1]
     under, away = (row > 143) & (row < 162), (row < 140 - 25) | (row > 165 + 25)
     assert under.sum() > 10
     assert not track.visible[under].any()
-    assert track.visible[away].mean() > 0.9
+    assert track.visible[away].mean() > ALL_BUT_ONE_PERCENT
     error = (track.positions - truth)[away & track.visible]
-    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.6e-3
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < MAX_RMS
 
 
 @pytest.mark.parametrize("blind", ["black", "covered"])
 def test_a_blind_frame_sees_nothing_and_the_next_recovers(blind):
-    """No error, no particle; afterwards the sheet is found again where the belief has it."""
+    """No error and no particle; then the sheet is found again from the predicted positions."""
     tracker, sheet = started()
     bare = stereo(seed=4)
     nothing = tracker.track(BLACK if blind == "black" else bare, tool(), predicted=sheet.rest)
     assert not nothing.visible.any()
     assert np.isnan(nothing.positions).all()
     again = tracker.track(stereo(lifted(2e-3), seed=5), tool(), predicted=sheet.rest)
-    assert again.visible.mean() > 0.9
+    assert again.visible.mean() > ALL_BUT_ONE_PERCENT
 
 
 def test_a_sheet_that_fell_back_is_found_at_rest():
@@ -114,10 +133,10 @@ def test_a_sheet_that_fell_back_is_found_at_rest():
     for k in range(1, 9):
         held = tool(grasp=1, closed=True, z=2e-3 * k)
         track = tracker.track(stereo(lifted(2e-3 * k), seed=k), held, predicted=sheet.rest)
-        assert track.visible.mean() > 0.9
-    fallen = tracker.track(stereo(PlaneSheet(), seed=9), tool(grasp=1), predicted=lifted(16e-3).carry(sheet.rest))
-    assert fallen.visible.mean() > 0.9
-    assert np.sqrt(np.nanmean(np.sum((fallen.positions - sheet.rest) ** 2, axis=1))) < 0.6e-3
+        assert track.visible.mean() > ALL_BUT_ONE_PERCENT
+    fallen = tracker.track(stereo(PlaneSheet(), seed=9), tool(grasp=1), predicted=lifted(16e-3).deformed(sheet.rest))
+    assert fallen.visible.mean() > ALL_BUT_ONE_PERCENT
+    assert np.sqrt(np.nanmean(np.sum((fallen.positions - sheet.rest) ** 2, axis=1))) < MAX_RMS
 
 
 def test_the_same_images_give_the_same_bytes():
@@ -137,16 +156,16 @@ def test_images_that_cannot_be_used_are_refused():
         tracker.start(stereo(), tool())
     with pytest.raises(PerceptionError, match="cameras swapped"):
         tracker.start(StereoPair(left=good.right, right=good.left), tool())
-    apart = [
+    sheets = [
         PlaneSheet(centre=np.array([x, 0, 0]), along=np.array([0.4, 0, 0]), across=np.array([0, 0.9, 0]))
         for x in (-0.015, 0.015)
     ]
     with pytest.raises(PerceptionError, match="two disconnected sheets"):
-        tracker.start(stereo(*apart), tool())
+        tracker.start(stereo(*sheets), tool())
 
 
-def test_a_mask_and_a_disparity_of_the_users_own_are_used():
-    """On a grey picture the built-in mask finds nothing; the user's say where the tissue is, and how far: f B / d."""
+def test_a_users_own_mask_and_disparity_are_used():
+    """On a grey image the built-in mask finds nothing; the user's mask and disparity, f B / Z, are used instead."""
     pair = stereo(PlaneSheet())
     left, right = (
         side.mean(axis=2, keepdims=True).repeat(3, axis=2).astype(np.uint8) for side in (pair.left, pair.right)
@@ -161,7 +180,7 @@ def test_a_mask_and_a_disparity_of_the_users_own_are_used():
         return inside
 
     def disparity(left, _right):
-        return np.full(left.shape[:2], FOCAL * BASELINE / 0.11, np.float32)
+        return np.full(left.shape[:2], FOCAL * BASELINE / DISTANCE, np.float32)
 
     sheet = StereoTracker(camera(), spacing=SPACING, mask=mask, disparity=disparity).start(grey, tool())
     assert len(sheet.rest) > 80 and np.abs(sheet.rest[:, 2]).max() < 1e-3

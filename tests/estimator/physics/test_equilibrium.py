@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import minimize
 
 from jiggle_mj.estimator.physics.block_tridiagonal import cholesky, multiply, solve
-from jiggle_mj.estimator.physics.equilibrium import ROUGH, equilibrium, newton_step
+from jiggle_mj.estimator.physics.equilibrium import MAX_LINEAR_RESIDUAL, equilibrium, newton_step
 from jiggle_mj.estimator.physics.surrogate import surrogate
 from jiggle_mj.observation import Declaration
 from tests.support.small_sheet import (
@@ -82,8 +82,8 @@ def test_a_step_that_single_precision_cannot_solve_is_solved_in_double():
         return float(jnp.linalg.norm(multiply(energy.layout, matrix, step) + gradient) / jnp.linalg.norm(gradient))
 
     rough = jax.tree.map(lambda part: part.astype(jnp.float32), (matrix, gradient))
-    assert not left(-solve(energy.layout, cholesky(rough[0]), rough[1]).astype(float)) < ROUGH
-    assert left(newton_step(energy.layout, matrix, gradient)) < 1e-3 * ROUGH
+    assert not left(-solve(energy.layout, cholesky(rough[0]), rough[1]).astype(float)) < MAX_LINEAR_RESIDUAL
+    assert left(newton_step(energy.layout, matrix, gradient)) < 1e-3 * MAX_LINEAR_RESIDUAL
 
 
 def test_scipy_finds_the_same_minimum():

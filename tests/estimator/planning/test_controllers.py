@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.filters.shots import simulator
 from jiggle_mj.estimator.physics.environment import Grip
+from jiggle_mj.estimator.physics.simulator import simulator
 from jiggle_mj.estimator.planning.controllers import (
     KEPT,
     PRIMITIVES,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jiggle_mj.estimator import Estimator, EstimatorConfig
-from jiggle_mj.estimator.filters.shots import SWEEPS, simulator
 from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.mesh import SheetMesh
+from jiggle_mj.estimator.physics.simulator import SWEEPS_PER_STEP, simulator
 from jiggle_mj.estimator.physics.surrogate import surrogate
 from jiggle_mj.eval.metrics.detection import agreement
 from jiggle_mj.eval.studies.paper_tables import OWN_FORCE_SD
@@ -36,7 +36,7 @@ def test_the_truth_is_the_engines_own_state(engine):
         assert set(observation.tool.held_tracks) == set(np.flatnonzero(grip.stiffness).tolist())
         if engine == "xpbd":
             start = before[1].positions if now.index == 3 else mesh.rest
-            x = simulator(mesh, found.declaration).step(jnp.asarray(start), b, grip, sweeps=SWEEPS)
+            x = simulator(mesh, found.declaration).step(jnp.asarray(start), b, grip, sweeps=SWEEPS_PER_STEP)
             np.testing.assert_allclose(now.positions, x, atol=1e-12)
         else:
             x = jnp.asarray(now.positions)

@@ -1,4 +1,4 @@
-"""The chamfer distance against brute force and differences; a sheet that meets a cloud."""
+"""The chamfer distance against brute force and differences; a sheet that is matched to a cloud."""
 
 import jax
 import jax.numpy as jnp
@@ -8,14 +8,18 @@ from scipy.spatial.distance import cdist
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
+from jiggle_mj.estimator.perception.chamfer import Chamfer, nearest
 from jiggle_mj.estimator.perception.cloud_tracker import CloudTracker, lay_mesh, offset, thinned
-from jiggle_mj.estimator.physics.chamfer import Chamfer, nearest
+from jiggle_mj.estimator.perception.config import CloudTrackerConfig
 from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.mesh import SheetMesh
 from jiggle_mj.observation import MeasuredPoints
 from tests.support.small_sheet import DECLARATION, GRIP_RADIUS, SPACING, attached, cloud, corners, lifts, sheet
 
 SD = 2e-4
+"""Noise of a point [m]."""
+ROUNDING = 1e-12
+"""Relative; sums of hundreds of terms of one sign in float64."""
 
 
 def measured(x: np.ndarray, seed: int) -> MeasuredPoints:
@@ -25,45 +29,47 @@ def measured(x: np.ndarray, seed: int) -> MeasuredPoints:
 @pytest.mark.parametrize("reach", [np.inf, 1.5e-3])
 def test_distance_and_gradient(reach):
     """Against all pairs, and against central differences over steps in which no nearest point changes."""
-    chamfer, there = Chamfer.build(sheet(), count=400, reach=reach), cloud(lifts()[3].x, 0, SD)
+    chamfer, target = Chamfer.build(sheet(), count=400, reach=reach), cloud(lifts()[3].x, 0, SD)
     x = jnp.asarray(lifts()[2].x)
-    apart = cdist(chamfer.sampled(x), there) ** 2
+    squared = cdist(chamfer.sampled(x), target) ** 2
     points = np.asarray(chamfer.sampled(x))
-    back = points[apart.argmin(axis=0)[apart.argmin(axis=1)]]
+    back = points[squared.argmin(axis=0)[squared.argmin(axis=1)]]
     shown = np.linalg.norm(points - back, axis=1) <= reach
     assert 0.5 < shown.mean() and shown.all() == np.isinf(reach)
-    expected = apart.min(axis=0).sum() + apart.min(axis=1)[shown].sum()
-    assert float(chamfer.distance(x, jnp.asarray(there))) == pytest.approx(expected, rel=1e-12)
-    distance = lambda y: chamfer.distance(y, jnp.asarray(there))  # noqa: E731
-    way = np.random.default_rng(2).normal(size=x.shape)
+    expected = squared.min(axis=0).sum() + squared.min(axis=1)[shown].sum()
+    assert float(chamfer.distance(x, jnp.asarray(target))) == pytest.approx(expected, rel=ROUNDING)
+    distance = lambda y: chamfer.distance(y, jnp.asarray(target))  # noqa: E731
+    direction = np.random.default_rng(2).normal(size=x.shape)
     step = 1e-9
-    difference = (distance(x + step * way) - distance(x - step * way)) / (2 * step)
-    assert float(jnp.sum(jax.grad(distance)(x) * way)) == pytest.approx(float(difference), rel=1e-4)
+    difference = (distance(x + step * direction) - distance(x - step * direction)) / (2 * step)
+    assert float(jnp.sum(jax.grad(distance)(x) * direction)) == pytest.approx(
+        float(difference), rel=1e-8
+    )  # rounding of a difference over 1e-9 m
 
 
 def test_sampled_points_lie_on_the_mesh():
     chamfer = Chamfer.build(sheet(), count=400, reach=np.inf)
-    np.testing.assert_allclose(np.sum(chamfer.weights, axis=1), 1, rtol=1e-12)
-    assert (np.asarray(chamfer.weights) > -1e-12).all()
-    rotated = lambda x: x[:, [1, 2, 0]] + 0.1  # noqa: E731
+    np.testing.assert_allclose(np.sum(chamfer.weights, axis=1), 1, rtol=ROUNDING)
+    assert (np.asarray(chamfer.weights) > -ROUNDING).all()
+    moved = lambda x: x[:, [1, 2, 0]] + 0.1  # noqa: E731
     rest = jnp.asarray(sheet().rest)
-    np.testing.assert_allclose(chamfer.sampled(rotated(rest)), rotated(chamfer.sampled(rest)), atol=1e-12)
+    np.testing.assert_allclose(chamfer.sampled(moved(rest)), moved(chamfer.sampled(rest)), atol=ROUNDING)
 
 
 def test_points_that_are_nan_are_nearest_to_nothing():
-    one, other = np.zeros((3, 3)), np.array([[np.nan] * 3, [1.0, 0, 0], [0.1, 0, 0]])
-    of_one, of_other = nearest(jnp.asarray(one), jnp.asarray(other))
-    np.testing.assert_array_equal(of_one, 2)
-    assert int(of_other[1]) == int(of_other[2]) == 0
+    first, second = np.zeros((3, 3)), np.array([[np.nan] * 3, [1.0, 0, 0], [0.1, 0, 0]])
+    in_second, in_first = nearest(jnp.asarray(first), jnp.asarray(second))
+    np.testing.assert_array_equal(in_second, 2)
+    assert int(in_first[1]) == int(in_first[2]) == 0
     chamfer, x = Chamfer.build(sheet(), count=400, reach=np.inf), jnp.asarray(sheet().rest)
-    there = cloud(sheet().rest, 0, SD)
-    padded = np.concatenate([there, np.full((200, 3), np.nan)])
-    assert float(chamfer.distance(x, jnp.asarray(padded))) == float(chamfer.distance(x, jnp.asarray(there)))
+    target = cloud(sheet().rest, 0, SD)
+    padded = np.concatenate([target, np.full((200, 3), np.nan)])
+    assert float(chamfer.distance(x, jnp.asarray(padded))) == float(chamfer.distance(x, jnp.asarray(target)))
 
 
 @pytest.fixture(scope="module")
-def met():
-    """Three increments of a lift, each met from the one before; and what was seen of the last."""
+def tracks():
+    """Return the tracks of three increments of a lift, each matched from the one before."""
     tracker = CloudTracker(Sheet(rest=sheet().rest, faces=sheet().faces), DECLARATION)
     corner, x, tracks = corners()[0], sheet().rest, []
     length = jnp.asarray(np.linalg.norm(x - corner, axis=1))
@@ -74,18 +80,21 @@ def met():
     return tracks
 
 
-def test_the_state_lies_on_the_cloud(met):
-    """Across the surface within the noise of a point and what the facets are off; along it less closely."""
+def test_the_state_lies_on_the_cloud(tracks):
+    """Across the surface within the noise of a point; along it within 8 % of the motion.
+
+    Measured: 0.7 standard deviations of a point, and 5 %.
+    """
     truth = lifts()[3].x
-    error = met[-1].positions - truth
+    error = tracks[-1].positions - truth
     moved = np.linalg.norm(truth - sheet().rest, axis=1)
-    sd = np.sqrt(np.linalg.eigvalsh(met[-1].covariance))
+    sd = np.sqrt(np.linalg.eigvalsh(tracks[-1].covariance))
     np.testing.assert_allclose(sd[:, 0], SD)
-    normal = np.linalg.eigh(met[-1].covariance)[1][:, :, 0]
+    normal = np.linalg.eigh(tracks[-1].covariance)[1][:, :, 0]
     across = np.abs(np.sum(error * normal, axis=1))
-    assert met[-1].visible.all() and moved.max() > 0.015
-    assert np.sqrt(np.mean(across**2)) < 3 * SD
-    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.25 * np.sqrt(np.mean(moved**2))
+    assert tracks[-1].visible.all() and moved.max() > 0.015
+    assert np.sqrt(np.mean(across**2)) < SD
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.08 * np.sqrt(np.mean(moved**2))
 
 
 def test_the_offset_is_the_mean_of_the_points_around_along_the_normal():
@@ -96,8 +105,8 @@ def test_the_offset_is_the_mean_of_the_points_around_along_the_normal():
 
 def test_what_no_point_lies_near_is_not_seen():
     tracker = CloudTracker(Sheet(rest=sheet().rest, faces=sheet().faces), DECLARATION)
-    there = cloud(sheet().rest, 0, SD)
-    half = MeasuredPoints(positions=there[there[:, 0] < 0], sd=SD)
+    target = cloud(sheet().rest, 0, SD)
+    half = MeasuredPoints(positions=target[target[:, 0] < 0], sd=SD)
     grip = Grip.build(jnp.asarray(sheet().rest), jnp.asarray(corners()[0]), radius=GRIP_RADIUS, stiffness=90.0)
     track = tracker.track(half, sheet().rest, np.zeros(sheet().n), grip)
     hidden = sheet().rest[:, 0] > 0.012 + SPACING
@@ -107,9 +116,9 @@ def test_what_no_point_lies_near_is_not_seen():
 
 
 def test_without_reach_the_hidden_part_is_pulled_to_the_seen_one():
-    """Why the paper's form is not the default."""
-    there = cloud(sheet().rest, 0, SD)
-    half, x = jnp.asarray(there[there[:, 0] < 0]), jnp.asarray(sheet().rest)
+    """This is why the paper's form is not the default."""
+    target = cloud(sheet().rest, 0, SD)
+    half, x = jnp.asarray(target[target[:, 0] < 0]), jnp.asarray(sheet().rest)
     hidden = np.asarray(sheet().rest)[:, 0] > 0.02
     built = [Chamfer.build(sheet(), count=400, reach=reach) for reach in (np.inf, SPACING)]
     pull = [np.abs(jax.grad(chamfer.distance)(x, half)) for chamfer in built]
@@ -117,23 +126,25 @@ def test_without_reach_the_hidden_part_is_pulled_to_the_seen_one():
 
 
 def test_a_mesh_over_clouds_at_rest():
+    """Neighbours are 0.75 to 1 spacings apart, heights a quarter of a point's noise off, the outline 7 % inside."""
     still = [measured(sheet().rest, seed) for seed in range(3)]
-    found = lay_mesh(still, spacing=SPACING)
-    gaps = cdist(found.rest, found.rest) + np.eye(len(found.rest))
-    assert 0.5 * SPACING < gaps.min(axis=1).mean() < 1.2 * SPACING
-    assert np.abs(found.rest[:, 2]).max() < 2 * SD
-    assert 0.8 * sheet().face_area.sum() < SheetMesh(found.rest, found.faces).face_area.sum() < sheet().face_area.sum()
+    laid = lay_mesh(still, spacing=SPACING)
+    gaps = cdist(laid.rest, laid.rest) + np.eye(len(laid.rest))
+    nearest_gap = gaps.min(axis=1).mean() / SPACING
+    assert CloudTrackerConfig.min_gap < nearest_gap < 1
+    assert np.abs(laid.rest[:, 2]).max() < 0.5 * SD
+    assert 0.9 < SheetMesh(laid.rest, laid.faces).face_area.sum() / sheet().face_area.sum() < 1
 
 
 def test_thinning_keeps_points_apart_and_leaves_no_hole():
     flat = np.random.default_rng(0).uniform(0, 1, (2000, 2))
     chosen = flat[thinned(flat, 0.1)]
-    apart = cdist(chosen, chosen) + np.eye(len(chosen))
-    assert apart.min() > 0.1 and cdist(flat, chosen).min(axis=1).max() <= 0.1
+    gaps = cdist(chosen, chosen) + np.eye(len(chosen))
+    assert gaps.min() > 0.1 and cdist(flat, chosen).min(axis=1).max() <= 0.1
 
 
 def test_too_few_points_are_refused():
-    with pytest.raises(PerceptionError, match=r"a sheet needs 20 \(more points, or a smaller"):
+    with pytest.raises(PerceptionError, match=r"a sheet needs 20 \(record more points, or choose a smaller"):
         lay_mesh([measured(sheet().rest, 0)], spacing=0.05)
     nothing = MeasuredPoints(positions=np.full((100, 3), np.nan), sd=SD)
     with pytest.raises(PerceptionError, match="have 0 points at most; a sheet needs 20"):
@@ -142,7 +153,7 @@ def test_too_few_points_are_refused():
     np.testing.assert_array_equal(lay_mesh(rest, spacing=SPACING).rest, lay_mesh(rest[1:], spacing=SPACING).rest)
 
 
-def test_a_cloud_of_nothing_shows_nothing():
+def test_a_cloud_without_points_shows_no_particle():
     tracker = CloudTracker(Sheet(rest=sheet().rest, faces=sheet().faces), DECLARATION)
     nothing = MeasuredPoints(positions=np.full((100, 3), np.nan), sd=SD)
     grip = Grip.build(jnp.asarray(sheet().rest), jnp.asarray(corners()[0]), radius=GRIP_RADIUS, stiffness=90.0)
