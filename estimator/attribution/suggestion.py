@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..physics.mesh import far_apart
-from ..planning.information_policy import PLACES, SLANTED, UP
+from ..planning.information_config import SLANTED, UP, InformationPolicyConfig
 from .closed_frames import USUAL_GAP, ClosedFrame, FrameHistory, Timed
 from .closing import Closed
 from .dataset import Dataset
@@ -64,7 +64,7 @@ def suggest(closed: Closed, dataset: Dataset, *, log: Callable[[str], None] = la
     fits, names = [one.fitted for one in hypotheses], tuple(one.effect.name for one in hypotheses)
     log(f"looking for a pull that tells {', '.join(names)} apart")
     rest, far, gap, radius = dataset.estimator.sheet.rest, *_usual(dataset)
-    places = far_apart(rest, PLACES).tolist()
+    places = far_apart(rest, InformationPolicyConfig().n_places).tolist()
 
     def tried(place: int, direction: Float[np.ndarray, " 3"]) -> tuple[float, int, Float[np.ndarray, " 3"]]:
         frames = _frames(dataset, place, far * direction, gap=gap, radius=radius)
