@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jiggle_mj.estimator.attribution.dataset import collect_dataset
-from jiggle_mj.estimator.attribution.held_out import from_rest, off, rms
+from jiggle_mj.estimator.attribution.held_out import from_rest, residuals, rms
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.recording.reader import Recording
@@ -49,7 +49,7 @@ def _error_by_grasp(problem: Problem, effects: list[dict[str, Any]]) -> str:
     plain = Point(theta=theta, s=np.zeros(states.shape[1]), states=states, seen=states)
     held_out = from_rest(problem, plain, list(range(len(frames))), by_tool=True)
     grasps = problem.history.by(lambda one: one.grasp, range(len(frames))).values()
-    each = [off(problem, held_out, grasp) for grasp in grasps]
+    each = [residuals(problem, held_out, grasp) for grasp in grasps]
     return f"{1e3 * rms(np.concatenate(each)):.1f} mm; by grasp " + ", ".join(f"{1e3 * rms(one):.1f}" for one in each)
 
 

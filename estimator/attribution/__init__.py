@@ -1,1 +1,1 @@
-"""From what a fit leaves over to the effect that the model lacks."""
+"""Attribution: from the unexplained residual of a fit to the effect that the model lacks."""

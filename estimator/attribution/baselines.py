@@ -1,4 +1,4 @@
-"""How a part is foretold without a model: if nothing moves, or each particle goes its own share of the tool's way."""
+"""Held-out predictions without a model: nothing moves, or each particle moves a share of the tool's displacement."""
 
 from dataclasses import dataclass, replace
 
@@ -10,45 +10,49 @@ from .held_out import rms
 
 
 def unmoved(frames: list[Timed], part: int) -> float:
-    """Root mean square error of a part's frames if all stayed where the jaws closed [m]."""
-    return _rms([one for one in _since_closed(frames) if one.part == part])
+    """Return the root mean square error of a part's frames if nothing moved since the jaws closed [m]."""
+    return _rms([motion for motion in _motions(frames) if motion.part == part])
 
 
 def in_proportion(frames: list[Timed], part: int) -> float:
-    """The same if each particle went along with the tool by the share that it did in the other parts [m]."""
-    every = _since_closed(frames)
-    others = [one for one in every if one.part != part]
-    ways, seen = np.array([one.way for one in others]), np.array([one.counted for one in others])
-    gone = np.array([np.where(one.counted[:, None], one.gone, 0.0) for one in others])
-    squared = np.einsum("kd,kd,kn->n", ways, ways, seen)
-    share = np.einsum("knd,kd->n", gone, ways) / np.maximum(squared, np.finfo(float).tiny)
-    left = [replace(one, gone=one.gone - share[:, None] * one.way[None]) for one in every if one.part == part]
-    return _rms(left)
+    """Return the same if each particle moved with the tool by a share that is fitted to the other parts [m]."""
+    motions = _motions(frames)
+    others = [motion for motion in motions if motion.part != part]
+    tool, counted = np.array([motion.tool for motion in others]), np.array([motion.counted for motion in others])
+    moved = np.array([np.where(motion.counted[:, None], motion.moved, 0.0) for motion in others])
+    squared = np.einsum("kd,kd,kn->n", tool, tool, counted)
+    share = np.einsum("knd,kd->n", moved, tool) / np.maximum(squared, np.finfo(float).tiny)
+    residual = [
+        replace(motion, moved=motion.moved - share[:, None] * motion.tool[None])
+        for motion in motions
+        if motion.part == part
+    ]
+    return _rms(residual)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _SinceClosed:
-    """One frame."""
+class _Motion:
+    """Motion of tool and particles since the jaws closed, in one frame."""
 
     part: int
-    way: Float[np.ndarray, " 3"]
-    """Of the tool [m]."""
-    gone: Float[np.ndarray, "n 3"]
-    """How far each particle has gone [m]."""
+    tool: Float[np.ndarray, " 3"]
+    """Displacement of the tool [m]."""
+    moved: Float[np.ndarray, "n 3"]
+    """Displacement of each particle [m]."""
     counted: Bool[np.ndarray, " n"]
-    """Whether it is seen, as it was then, and not held."""
+    """Whether a particle is observed in both frames, and not held."""
 
 
-def _since_closed(frames: list[Timed]) -> list[_SinceClosed]:
+def _motions(frames: list[Timed]) -> list[_Motion]:
     first: dict[int, ClosedFrame] = {}
-    found = []
-    for one in frames:
-        then, now = first.setdefault(one.grasp, one.frame), one.frame
-        counted = np.asarray(now.counted & then.visible)
-        gone = np.asarray(now.y) - np.asarray(then.y)
-        found.append(_SinceClosed(part=one.part, way=np.asarray(now.way), gone=gone, counted=counted))
-    return found
+    motions = []
+    for timed in frames:
+        closed, now = first.setdefault(timed.grasp, timed.frame), timed.frame
+        counted = np.asarray(now.counted & closed.visible)
+        moved = np.asarray(now.y) - np.asarray(closed.y)
+        motions.append(_Motion(part=timed.part, tool=np.asarray(now.displacement), moved=moved, counted=counted))
+    return motions
 
 
-def _rms(frames: list[_SinceClosed]) -> float:
-    return rms(np.concatenate([one.gone[one.counted] for one in frames]))
+def _rms(motions: list[_Motion]) -> float:
+    return rms(np.concatenate([motion.moved[motion.counted] for motion in motions]))

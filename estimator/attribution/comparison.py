@@ -1,101 +1,117 @@
-"""Effects against each other, and against having none: by what they explain, and by what they foretell."""
+"""Compare effects with each other, and with none: by log Bayes factors and held-out predictions."""
 
 from .held_out import HeldOut
-from .hypotheses import ABSURD, ENTER, REMAINDER, FitContext, Hypothesis
+from .hypotheses import (
+    MAX_PRIOR_SDS,
+    MAX_UNEXPLAINED_GAIN,
+    MIN_LOG_BAYES_FACTOR,
+    FitContext,
+    Hypothesis,
+)
 
-LEAD = 3.0
-"""By how much an effect must lead the next to be named alone, whatever the shares [nat]."""
-FORETELLING = 0.25
-"""Power of the error by which the nats that an effect explains are divided when the best is looked for."""
-AS_GOOD, CONFUSED = 0.8, 0.6
-"""Shares of its error from which an effect counts as no worse than the best, and one that is often confused with it."""
-EXPLAINED = 0.85
-"""Share of the best log Bayes factor from which an effect counts as explaining as much."""
-BETTER, DECISIVE = 0.97, 0.8
-"""Shares of the error over all parts left out that an effect must bring it to, unless it accounts for all that was left
-over or is certain, and from which on it need be neither likely nor beat larger errors without a cause."""
-LIKELY, LITTLE = 30.0, 20.0
-"""Log Bayes factor from which an effect is added [nat]: a mesh that is not the sheet's, and noise that is not quite as
-it is taken, were worth up to 26. And what it leaves to larger errors up to which such an effect is certain [nat]: it
-need not foretell better then, but no worse, one part aside if there are more than two. What is felt in one grasp alone
-cannot be foretold by others, and a part that is missed by far, for attachments that only it would show, outweighs the
+MIN_LEAD = 3.0
+"""Difference of log Bayes factors by which an effect must at least lead the next one to be named alone [nat]."""
+ERROR_EXPONENT = 0.25
+"""Power of the held-out error by which log Bayes factors are divided to find the best effect."""
+EQUAL_ERROR, CONFUSED_EQUAL_ERROR = 0.8, 0.6
+"""Best error over an effect's error from which the two predict equally well; the second if both are often confused."""
+EQUAL_EVIDENCE = 0.85
+"""Share of the best log Bayes factor from which an effect explains as much."""
+REQUIRED_ERROR = 0.97
+"""Share of the held-out error without an effect that it must reach with it, unless the effect accounts for the whole
+unexplained residual or is certain."""
+DECISIVE_ERROR = 0.8
+"""Share of the held-out error below which an effect need neither be likely nor beat larger unexplained errors."""
+LIKELY_LOG_BAYES_FACTOR = 30.0
+"""Log Bayes factor from which an effect is added [nat]. Measured: a mesh that is not the sheet's, and noise that is not
+quite as assumed, reached up to 26."""
+CERTAIN_UNEXPLAINED_GAIN = 20.0
+"""Gain of larger unexplained errors up to which a likely effect is certain [nat]. It must then predict held-out parts
+no worse, instead of better, the worst part aside if there are more than two. What acts in one grasp alone cannot be
+predicted from the others; and one part with a large error, for attachments that only it would show, outweighs the
 rest."""
-OUTDONE = 0.75
-"""Share of the log Bayes factor of one that is refused up to which a less likely effect is not added in its place."""
+REFUSED_SHARE = 0.75
+"""Share of a refused effect's log Bayes factor below which a less likely effect is not added in its place."""
 
 
 def best(passed: list[Hypothesis]) -> Hypothesis:
-    """The one with most nats over the fourth root of its error."""
+    """Return the hypothesis with the largest log Bayes factor over the fourth root of its held-out error."""
     if not passed[0].folds:
         return max(passed, key=lambda one: one.log_bayes_factor)
-    return max(passed, key=lambda one: one.log_bayes_factor / one.residual**FORETELLING)
+    return max(passed, key=lambda one: one.log_bayes_factor / one.held_out_rms**ERROR_EXPONENT)
 
 
 def behind(one: Hypothesis, best: Hypothesis) -> str:
-    """Why an effect is neither added nor named beside the best."""
+    """Return why an effect is neither added nor named beside the best."""
     explains_more = one.log_bayes_factor > best.log_bayes_factor
-    if best.folds and (explains_more or best.residual < AS_GOOD * one.residual):
-        return f"{best.effect.name} foretells better, to {1e3 * best.residual:.2f} mm against {1e3 * one.residual:.2f}"
+    if best.folds and (explains_more or best.held_out_rms < EQUAL_ERROR * one.held_out_rms):
+        errors = f"{1e3 * best.held_out_rms:.2f} mm against {1e3 * one.held_out_rms:.2f} mm"
+        return f"{best.effect.name} predicts held-out parts better, to {errors}"
     return f"{best.effect.name} is likelier by {best.log_bayes_factor - one.log_bayes_factor:.0f} nat"
 
 
-def not_told_from(one: Hypothesis, best: Hypothesis) -> bool:
-    """Whether an effect explains as much as the best, and foretells what was left out about as well.
+def indistinguishable(one: Hypothesis, best: Hypothesis) -> bool:
+    """Return whether an effect explains as much as the best one, and predicts held-out parts about as well.
 
-    For two that are often confused with each other it takes less, and where one explains more and the other foretells
-    better. It takes more where it has more parameters and yet explains less: whatever else is wrong favours these.
+    Less is required if the two are often confused with each other, or if one explains more and the other predicts
+    better. More is required if the effect has more parameters and yet explains less, because any other error of the
+    model favours more parameters.
     """
     likelier = best.log_bayes_factor - one.log_bayes_factor
     if not best.folds:
-        return likelier < LEAD
+        return likelier < MIN_LEAD
     confused = one.effect.name in best.effect.confounded_with and best.effect.name in one.effect.confounded_with
     if confused or likelier < 0:
-        return one.residual * CONFUSED <= best.residual
-    lead = LEAD if len(one.at) > len(best.at) else max(LEAD, (1 - EXPLAINED) * best.log_bayes_factor)
-    return likelier < lead and one.residual * AS_GOOD <= best.residual
+        return one.held_out_rms * CONFUSED_EQUAL_ERROR <= best.held_out_rms
+    lead = MIN_LEAD if len(one.at) > len(best.at) else max(MIN_LEAD, (1 - EQUAL_EVIDENCE) * best.log_bayes_factor)
+    return likelier < lead and one.held_out_rms * EQUAL_ERROR <= best.held_out_rms
 
 
 def outdone(one: Hypothesis, refused: list[Hypothesis]) -> str | None:
-    """Why an effect is not added where a far likelier one was refused; None if there is none such.
+    """Return why an effect is not added, if a far likelier one was refused; None if there is no such one.
 
-    What is wrong is then something like that one, of which this explains a little.
+    The true cause then resembles the refused effect, of which this one explains a part.
     """
     for other in refused:
-        if other.sensible and one.log_bayes_factor < OUTDONE * other.log_bayes_factor:
+        if other.sensible and one.log_bayes_factor < REFUSED_SHARE * other.log_bayes_factor:
             lead = other.log_bayes_factor - one.log_bayes_factor
-            return f"{other.effect.name} is likelier by {lead:.0f} nat, and refused itself"
+            return f"{other.effect.name} is likelier by {lead:.0f} nat, and was refused itself"
     return None
 
 
 def against(best: Hypothesis, context: FitContext, head_start: float = 0.0) -> str | None:
-    """Why an effect is not added; None if it is.
+    """Return why an effect is not added; None if it is.
 
-    Against a stage than which the one that it is added to is likelier by `head_start` [nat].
+    Args:
+        best: the effect.
+        context: the fit that it is compared with.
+        head_start: log Bayes factor of the fit that the effect is added to, against `context` [nat].
     """
-    assert best.left is not None and best.folds is not None
+    assert best.unexplained is not None and best.folds is not None
     if not best.sensible:
-        return f"its size is beyond {ABSURD:g} prior standard deviations"
-    before, after = _residual(context.folds), _residual(best.folds)
-    likelier = best.log_bayes_factor + head_start + best.left.gain - context.left.gain
-    if after > DECISIVE * before:
-        if best.log_bayes_factor < LIKELY:
-            return f"it explains {best.log_bayes_factor:.0f} nat, less than the {LIKELY:g} from which one is added"
-        if likelier < ENTER:
-            return "larger errors without a cause explain the frames as well"
+        return f"its size is beyond {MAX_PRIOR_SDS:g} prior standard deviations"
+    before, after = _rms(context.folds), _rms(best.folds)
+    likelier = best.log_bayes_factor + head_start + best.unexplained.gain - context.unexplained.gain
+    if after > DECISIVE_ERROR * before:
+        if best.log_bayes_factor < LIKELY_LOG_BAYES_FACTOR:
+            return f"its log Bayes factor is {best.log_bayes_factor:.0f} nat, below {LIKELY_LOG_BAYES_FACTOR:g} nat"
+        if likelier < MIN_LOG_BAYES_FACTOR:
+            return "larger errors without a named cause explain the frames as well"
     parts = list(zip(context.folds, best.folds, strict=True))
     better = sum(b.rms < a.rms for a, b in parts)
-    certain = best.log_bayes_factor >= LIKELY and best.left.gain < LITTLE
-    enough = 1.0 if certain or best.left.gain < REMAINDER < context.left.gain else BETTER
+    certain = best.log_bayes_factor >= LIKELY_LOG_BAYES_FACTOR and best.unexplained.gain < CERTAIN_UNEXPLAINED_GAIN
+    accounts_for_all = best.unexplained.gain < MAX_UNEXPLAINED_GAIN < context.unexplained.gain
+    required = 1.0 if certain or accounts_for_all else REQUIRED_ERROR
     counted = sorted(parts, key=lambda pair: pair[1].rms / pair[0].rms)[: max(len(parts) - 1, 2)] if certain else parts
-    worse = _residual([b for _, b in counted]) > enough * _residual([a for a, _ in counted])
+    worse = _rms([b for _, b in counted]) > required * _rms([a for a, _ in counted])
     if parts and (worse or 2 * better < len(parts)):
         return (
-            f"parts left out are foretold to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
+            f"held-out parts are predicted to {1e3 * after:.2f} mm with it and {1e3 * before:.2f} mm without, "
             f"better in {better} of {len(parts)}"
         )
     return None
 
 
-def _residual(parts: list[HeldOut]) -> float:
-    """Root mean square error over some parts [m]; 1 without any."""
+def _rms(parts: list[HeldOut]) -> float:
+    """Return the root mean square error over some parts [m]; 1 without any."""
     return HeldOut.together(parts).rms if parts else 1.0

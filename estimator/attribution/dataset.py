@@ -1,4 +1,4 @@
-"""A recording's frames with closed jaws, as the estimator saw them while it followed the recording."""
+"""Collect a recording's frames with closed jaws, with the estimator's states and the noise."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -19,28 +19,33 @@ from .closed_frames import ClosedFrame, Timed
 from .held_shape import another_shape
 from .still_noise import StillNoise, measure
 
-ASSUMED_SD, ASSUMED_LENGTH = 2e-4, 1.2e-2
-"""White and smooth part of what is seen, each, and the range, where neither still frames nor the recording say [m]."""
-
-STANDING = 1e-3
-"""How far the tool may say that it has gone since the jaws closed while nothing counts as moved yet [m]."""
-PARTS = 3
-"""Into which a single grasp is divided; the last is foretold and chooses no effect."""
+ASSUMED_SD = 2e-4
+"""Standard deviation of the white and of the smooth noise each, where neither still frames nor the recording give it
+[m]."""
+ASSUMED_LENGTH = 1.2e-2
+"""Range of the smooth noise where there are no still frames [m]."""
+MAX_RESTING_DISPLACEMENT = 1e-3
+"""Reported displacement of the tool since the jaws closed up to which the sheet counts as still [m]."""
+N_PARTS = 3
+"""Parts into which a single grasp is divided; the last one chooses no effect."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset:
-    """All that a loop is closed over."""
+    """Everything that effects are fitted to."""
 
     estimator: Estimator
+    """The estimator after the recording."""
     frames: list[Timed]
+    """Frames with closed jaws, in the order of time."""
     noise: StillNoise
+    """Noise of observed positions."""
     fields: Float[np.ndarray, "n modes"]
-    """Of the noise's smooth part; the frames' precisions hold the rest [m]."""
+    """Fields of the noise's smooth part [m]; the frames' precisions hold the rest."""
     detection: Detection
-    """With nothing but what is declared."""
+    """Detection with the declared model alone."""
     left_out: tuple[int, ...]
-    """Indices of frames in which what is held is seen in another shape than when the jaws closed on it."""
+    """Indices of excluded frames, in which what is held is observed in another shape than when the jaws closed."""
 
 
 def collect_dataset(
@@ -51,21 +56,28 @@ def collect_dataset(
     config: EstimatorConfig | None = None,
     on_frame: Callable[[Observation, Estimate | None], None] = lambda observation, found: None,
 ) -> Dataset:
-    """Follow a recording.
+    """Run the estimator over a recording and return its frames with closed jaws.
+
+    Args:
+        declaration: of the sheet.
+        camera: None for tracked points.
+        observations: all of the recording.
+        config: of the estimator; its refinement is set to "end".
+        on_frame: called after each frame.
 
     Raises:
         PerceptionError: no frame with closed jaws could be used.
     """
     config = replace(config or EstimatorConfig(), refinement="end")
-    estimator, frames, summary = Estimator(declaration, camera, config=config), [], ASSUMED_SD
+    estimator, frames, stated_sd = Estimator(declaration, camera, config=config), [], ASSUMED_SD
     still: list[MeasuredPoints] = []
-    standing: dict[int, list[MeasuredPoints]] = {}
+    resting: dict[int, list[MeasuredPoints]] = {}
     grasp, closed = -1, 0
     for observation in observations:
         found = estimator.update(observation)
         on_frame(observation, found)
         if observation.points is not None:
-            summary = observation.points.sd
+            stated_sd = observation.points.sd
         if found is None:
             if not frames and observation.points is not None:
                 still.append(observation.points)
@@ -73,12 +85,12 @@ def collect_dataset(
         if observation.tool.grasp != grasp:
             grasp, closed = observation.tool.grasp, observation.time
         frames.append(_timed(estimator, observation, found, closed=closed))
-        if observation.points is not None and np.linalg.norm(frames[-1].frame.way) < STANDING:
-            standing.setdefault(grasp, []).append(observation.points)
+        if observation.points is not None and np.linalg.norm(frames[-1].frame.displacement) < MAX_RESTING_DISPLACEMENT:
+            resting.setdefault(grasp, []).append(observation.points)
     if not frames:
-        raise PerceptionError("no frame with closed jaws could be used, so there is nothing to close the loop over.")
+        raise PerceptionError("no frame with closed jaws could be used, so there is nothing to fit effects to.")
     estimator.release()
-    noise = _noise_of([still], estimator) or _noise_of(list(standing.values()), estimator) or assumed(summary)
+    noise = _noise_of([still], estimator) or _noise_of(list(resting.values()), estimator) or assumed(stated_sd)
     fields, sd = noise.fields(estimator.sheet.rest)
     mistaken = another_shape(frames, sd, fields)
     return Dataset(
@@ -92,7 +104,7 @@ def collect_dataset(
 
 
 def assumed(sd: float) -> StillNoise:
-    """Where there are too few still frames: what is stated of each point, and as much that neighbours share."""
+    """Return the noise assumed where there are too few still frames: the stated sd [m], and as much smooth noise."""
     return StillNoise(sd=sd, smooth_sd=sd, length=ASSUMED_LENGTH, frames=0)
 
 
@@ -108,7 +120,7 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, c
             held=jnp.asarray(hold.held),
             force_unknown=jnp.asarray(estimator.force_unknown(hold.held)),
             rotated=jnp.asarray(hold.rotated(observation.tool)),
-            way=jnp.asarray(observation.tool.position - hold.tip),
+            displacement=jnp.asarray(observation.tool.position - hold.tip),
             by_points=jnp.asarray(observation.tool.by_points),
             held_sd=jnp.zeros(()),
         )
@@ -129,7 +141,7 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, c
 
 
 def _weighed(one: Timed, sd: float, fields: Float[np.ndarray, "n modes"]) -> Timed:
-    """With what the noise says of how well single particles, and the held ones together, are seen."""
+    """Return a frame with the precision of its particles, and of the mean of what is held, under the noise."""
     held = np.asarray(one.frame.held & one.frame.visible)
     shared = np.sum(fields[held].mean(axis=0) ** 2) + sd**2 / held.sum() if held.any() else 0.0
     with jax.enable_x64(True):
@@ -138,26 +150,26 @@ def _weighed(one: Timed, sd: float, fields: Float[np.ndarray, "n modes"]) -> Tim
 
 
 def _without(frames: list[Timed], mistaken: list[int]) -> list[Timed]:
-    """All but some; what the tool reported with them goes to the frame after, of the same grasp."""
+    """Return all but some frames; their reports of the tool go to the next frame of the same grasp."""
     kept: list[Timed] = []
-    told: tuple[tuple[float, Float[np.ndarray, " 3"]], ...] = ()
+    reports: tuple[tuple[float, Float[np.ndarray, " 3"]], ...] = ()
     for k, one in enumerate(frames):
-        told = (told if k and one.grasp == frames[k - 1].grasp else ()) + one.reports
+        reports = (reports if k and one.grasp == frames[k - 1].grasp else ()) + one.reports
         if k not in mistaken:
-            kept.append(replace(one, reports=told))
-            told = ()
+            kept.append(replace(one, reports=reports))
+            reports = ()
     return kept
 
 
 def _parted(frames: list[Timed]) -> list[Timed]:
-    """A single grasp in `PARTS`, one after the other, if it is long enough."""
-    if len({one.grasp for one in frames}) > 1 or len(frames) <= PARTS:
+    """Return a single grasp divided into `N_PARTS` in the order of time, if it is long enough."""
+    if len({one.grasp for one in frames}) > 1 or len(frames) <= N_PARTS:
         return frames
-    return [replace(one, part=1 + PARTS * k // len(frames)) for k, one in enumerate(frames)]
+    return [replace(one, part=1 + N_PARTS * k // len(frames)) for k, one in enumerate(frames)]
 
 
 def _noise_of(series: list[list[MeasuredPoints]], estimator: Estimator) -> StillNoise | None:
-    """From tracked points in series of frames in which nothing moves."""
+    """Return the noise from tracked points in series of frames without motion; None without tracks or frames."""
     ids = estimator.track_ids
     if ids is None:
         return None

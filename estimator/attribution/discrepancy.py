@@ -1,4 +1,4 @@
-"""What closing the loop found, as `discrepancy.json` holds it."""
+"""Content of `discrepancy.json`: the result of closing the loop."""
 
 from typing import Any
 
@@ -12,12 +12,15 @@ from .suggestion import Suggestion
 
 
 def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
-    """Numbers, strings and lists alone; lengths in metres, log Bayes factors in nat. No pull is suggested yet."""
-    first, last = closed.stages[0], closed.stages[-1]
+    """Return the result as numbers, strings and lists; lengths in metres, log Bayes factors in nat.
+
+    `suggestion` and the detections are None, to be filled in later.
+    """
+    first, last = closed.contexts[0], closed.contexts[-1]
     noise, before = dataset.noise, localisation(closed.problem, first.fitted)
     return {
         "verdict": closed.verdict,
-        "effects": [_effect(closed, *each) for each in zip(closed.accepted, closed.rivals, strict=True)],
+        "effects": [_effect(closed, *pair) for pair in zip(closed.accepted, closed.rivals, strict=True)],
         "ambiguous_with": list(dict.fromkeys(one.effect.name for rivals in closed.rivals for one in rivals)),
         "refused": [{"name": one.effect.name, "why": why} for one, why in closed.refused],
         "tested": [effect.name for effect in closed.problem.sheet.library],
@@ -30,14 +33,14 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
             }
             for one in first.scores
         ],
-        "left_over": [
+        "unexplained_residual": [
             {
-                "gain": one.left.gain,
-                "force_variance": one.left.variance,
-                "smooth_amplitude": one.left.amplitude,
-                "tool_variance": one.left.tool_variance,
+                "gain": context.unexplained.gain,
+                "force_variance": context.unexplained.variance,
+                "smooth_amplitude": context.unexplained.amplitude,
+                "tool_variance": context.unexplained.tool_variance,
             }
-            for one in closed.stages
+            for context in closed.contexts
         ],
         "held_out": {
             "folds": [
@@ -72,22 +75,22 @@ def _effect(closed: Closed, one: Hypothesis, rivals: list[Hypothesis]) -> dict[s
         "log_bayes_factor": one.log_bayes_factor,
         "p_value": one.score.p_value,
         "this_session_alone": one.effect.sensing,
-        "not_told_from": [rival.effect.name for rival in rivals],
+        "indistinguishable_from": [rival.effect.name for rival in rivals],
         "often_confused_with": list(one.effect.confounded_with),
     }
 
 
 def _baselines(closed: Closed, dataset: Dataset) -> dict[str, float | None]:
-    """Of the same grasp, without a model."""
+    """Return the errors without a model for the part that chose no effect."""
     spare = None if closed.reported is None else dataset.frames[-1].part
     return {
-        f"{name}_rms_m": None if spare is None else of(dataset.frames, spare)
-        for name, of in (("unmoved", unmoved), ("in_proportion", in_proportion))
+        f"{name}_rms_m": None if spare is None else error(dataset.frames, spare)
+        for name, error in (("unmoved", unmoved), ("in_proportion", in_proportion))
     }
 
 
 def suggested(found: Suggestion) -> dict[str, Any]:
-    """What stands under `suggestion`."""
+    """Return the content of `suggestion`."""
     return {
         "grasp_m": found.grasp.tolist(),
         "pull_m": found.pull.tolist(),
@@ -99,7 +102,7 @@ def suggested(found: Suggestion) -> dict[str, Any]:
 
 
 def _reported(reported: tuple[HeldOut, HeldOut] | None) -> dict[str, float | None]:
-    """On the grasp that chose no effect."""
+    """Return the figures of the part that chose no effect; None without one."""
     figures: dict[str, float | None] = {}
     for when, found in zip(("before", "after"), reported or (None, None), strict=True):
         figures[f"{when}_rms_m"] = None if found is None else found.rms

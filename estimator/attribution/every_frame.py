@@ -1,4 +1,4 @@
-"""All frames of a recording at a point: how their misfits weigh, their normal equations, and what misfits cost."""
+"""All frames of a recording at a point: their weights, normal equations, residuals and cost."""
 
 from collections.abc import Callable, Iterable
 
@@ -13,23 +13,23 @@ from .linear import N_FIELDS, Metric, NormalEquations, WeightedResiduals, misfit
 from .normal_equations import less_offset
 from .problem import Point, Problem
 
-DIRECTIONS = 22
-"""Parameters that are fitted together, in most fits at most."""
+N_DIRECTIONS = 22
+"""Number of parameters that most fits pad to, so that one compilation serves them."""
 
 
 def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
-    """Unit vectors along parameters, padded to a width that most fits share, so that they are compiled once."""
-    along = np.zeros((problem.sheet.size, max(DIRECTIONS, len(free))))
+    """Return unit vectors along parameters, padded to a width that most fits share."""
+    along = np.zeros((problem.sheet.size, max(N_DIRECTIONS, len(free))))
     along[free, np.arange(len(free))] = 1
     return along
 
 
 def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metric]:
-    """Every frame at a point: how misfits weigh."""
+    """Return the weights of residuals of each frame at a point."""
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
 
-    def one(k: int, frame: ClosedFrame, moment: FrameContext, x: Float[Array, "n 3"]) -> Metric:
-        return weigh(problem.sheet, theta, s, frame, moment, x, noise)
+    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> Metric:
+        return weigh(problem.sheet, theta, s, frame, context, x, noise)
 
     return _each(problem, point, frames, one)
 
@@ -37,32 +37,32 @@ def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metr
 def linearised(
     problem: Problem, point: Point, weights: dict[int, Metric], along: Float[np.ndarray, "p d"]
 ) -> dict[int, NormalEquations]:
-    """Every frame where it was weighed: its normal equations."""
+    """Return the normal equations of each frame, linearised where its weights were computed."""
     theta, along_ = jnp.asarray(point.theta), jnp.asarray(along)
 
-    def one(k: int, frame: ClosedFrame, moment: FrameContext, x: Float[Array, "n 3"]) -> NormalEquations:
-        return normal_equations(problem.sheet, weights[k], theta, along_, frame, moment)
+    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> NormalEquations:
+        return normal_equations(problem.sheet, weights[k], theta, along_, frame, context)
 
     return _each(problem, point, weights, one)
 
 
 def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> float:
-    """Twice the misfit of a point's predictions [nat], under weights that were reckoned elsewhere."""
+    """Return twice the negative log likelihood of a point's predictions [nat], under weights of another point."""
     return cost(problem, weights, residual(problem, weights, point), problem.amplitude)
 
 
 def residual(problem: Problem, weights: dict[int, Metric], point: Point) -> dict[int, WeightedResiduals]:
-    """How a point's predictions miss every frame, under weights that were reckoned elsewhere."""
+    """Return the weighted residuals of a point's predictions in each frame, under weights of another point."""
     theta = jnp.asarray(point.theta)
 
-    def one(k: int, frame: ClosedFrame, moment: FrameContext, x: Float[Array, "n 3"]) -> WeightedResiduals:
-        return misfit(problem.sheet, weights[k], theta, frame, moment, x)
+    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> WeightedResiduals:
+        return misfit(problem.sheet, weights[k], theta, frame, context, x)
 
     return _each(problem, point, weights, one)
 
 
 def cost(problem: Problem, weights: dict[int, Metric], every: dict[int, WeightedResiduals], amplitude: float) -> float:
-    """Twice what frames are missed by together [nat], with smooth force fields of that amplitude."""
+    """Return twice the negative log likelihood of residuals [nat], for an amplitude of the smooth force fields."""
     total = 0.0
     for frames in problem.by_part(weights).values():
         tool = np.array([np.asarray(every[k].tool)[:, None] for k in frames])
@@ -78,9 +78,9 @@ def _each(
     problem: Problem,
     point: Point,
     frames: Iterable[int],
-    of: Callable[[int, ClosedFrame, FrameContext, Float[Array, "n 3"]], T],
+    function: Callable[[int, ClosedFrame, FrameContext, Float[Array, "n 3"]], T],
 ) -> dict[int, T]:
-    """A function of each frame, of what an effect may know of it, and of its state, at a point."""
+    """Return a function of each frame, its context and its state at a point, for some frames in parallel."""
     states, history = jnp.asarray(point.states), problem.history
-    moments = {k: history.moment(k, states) for k in frames}
-    return parallel_map(lambda k: of(k, history.frames[k].frame, moments[k], states[k]), moments)
+    contexts = {k: history.context(k, states) for k in frames}
+    return parallel_map(lambda k: function(k, history.frames[k].frame, contexts[k], states[k]), contexts)

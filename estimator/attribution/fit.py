@@ -1,8 +1,8 @@
-"""Stiffnesses and the parameters of some effects, fitted to a recording's predicted equilibria together.
+"""Fit stiffnesses and the parameters of some effects to all predicted equilibria of a recording.
 
-Gauss-Newton with the weights of the state at hand [iteratively reweighted: Green 1984, JRSS B 46:149]: a step is taken
-if it lessens the misfit under the weights that it was reckoned with, so that nothing is won by weights that forgive
-more. Stiffnesses go where the belief says.
+Gauss-Newton with the weights of the current state [iteratively reweighted: Green 1984, JRSS B 46:149]. A step is
+accepted if it lowers the cost under the weights that it was computed with, so that weights which are more tolerant gain
+nothing. Stiffnesses step to where the belief has them.
 """
 
 from collections.abc import Callable
@@ -22,78 +22,83 @@ from .normal_equations import reduced
 from .problem import Point, Problem
 from .sheet import predict_all
 
-ODDS = 2.2
-"""What an attachment costs: the logarithm of nine to one [nat]."""
-STIFFEST = 0.98
+ATTACHMENT_LOG_ODDS = 2.2
+"""Prior cost of an attachment: the logarithm of nine to one [nat]."""
+MAX_STIFFNESS = 0.98
 """Largest bounded stiffness."""
-PASSES, PATIENCE = 10, 2
-"""Most Gauss-Newton steps, and most in turn after which the cost under its own weights is no less than it was before: a
-fit that leads to where weights forgive more, and back, is taken where it cost least."""
-SHORTER = (1.0, 0.4, 0.15, 0.05)
+MAX_GAUSS_NEWTON_STEPS = 10
+"""Largest number of Gauss-Newton steps."""
+PATIENCE = 2
+"""Steps in a row without a lower cost under the own weights, after which the fit ends. A fit that leads to more
+tolerant weights and back ends where it cost least."""
+STEP_SHARES = (1.0, 0.4, 0.15, 0.05)
 """Shares of a step that are tried."""
-FARTHEST, OWN_FARTHEST, FAR = 4.0, 3.0, 1.5
-"""Most that an effect's parameter and one of the sheet's own may be from 0, and that one may change in a step, in prior
-standard deviations."""
-GAIN = 2.5e-4
-"""Share of its cost by which normal equations must promise that a step lessens it; below, the fit has come to its end.
-What they promise is kept to within a third near there, and to weigh all frames anew costs ten times a prediction."""
-LEAST = 1e-2
-"""Precision with which a factor of all s is 1, as nothing tells it where none is attached."""
+MAX_EFFECT, MAX_NUISANCE = 4.0, 3.0
+"""Largest size of a parameter of an effect, and of a nuisance parameter [prior standard deviations]."""
+MAX_CHANGE = 1.5
+"""Largest change of a parameter in one step [prior standard deviations]."""
+MIN_RELATIVE_GAIN = 2.5e-4
+"""Share of the cost by which the normal equations must predict that a step lowers it; otherwise the fit has converged.
+Near there the predicted gain is right to within a third, and new weights for all frames cost ten predictions."""
+FACTOR_PRECISION = 1e-2
+"""Prior precision of a common factor of all s about 1. It decides where no frame shows an attachment."""
 Step = tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
-"""Of the parameters and of s."""
+"""Change of the parameters and of s."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """The end of a fit."""
+    """Result of a fit."""
 
     point: Point
+    """Fitted parameters and states."""
     around: Point
-    """Where weights were reckoned and frames linearised: `point`, or a step before it."""
+    """Point where weights were computed and frames linearised: `point`, or one step before it."""
     named: np.ndarray
-    """Parameters of the effects that are taken to be there."""
+    """Parameters of the effects in the model."""
     free: np.ndarray
-    """All that were fitted, the sheet's own among them."""
+    """All fitted parameters, nuisance parameters included."""
     square: Float[np.ndarray, "k k"]
-    """Normal equations, over s, the free parameters and -1."""
+    """Normal equations over s, the free parameters and -1."""
     equations: dict[int, NormalEquations]
+    """Normal equations of each frame."""
     weights: dict[int, Metric]
-    """By frame."""
+    """Weights of the residuals of each frame."""
     summary: PosteriorSummary
-    """What is believed of the attachments, whatever the free parameters are."""
+    """Posterior of the attachments, with the free parameters marginalised."""
     cost: float
     """Twice the negative logarithm of likelihood and prior under its own weights [nat]."""
 
     @property
     def belief(self) -> AttachmentBelief:
-        """Of the attachments."""
+        """Return the belief about the attachments."""
         assert isinstance(self.summary.belief, AttachmentBelief)
         return self.summary.belief
 
     @property
     def site_precision(self) -> Float[np.ndarray, " n"]:
-        """How sure the belief is of each s besides what frames say."""
+        """Return the precision that the belief has of each s in addition to the frames' evidence."""
         return np.asarray(self.belief.site_precision)
 
     @property
     def probability(self) -> Float[np.ndarray, " n"]:
-        """P(attached) of each. Of attachments that are likeliest together none need be likely by itself."""
+        """Return P(attached) of each particle; one of the likeliest set need not be likely itself."""
         return np.asarray(self.summary.probability)
 
     @property
     def attached(self) -> Bool[np.ndarray, " n"]:
-        """What is likelier attached than not."""
+        """Return which particles are more likely attached than not."""
         return self.probability > 0.5
 
 
 def start(problem: Problem, theta: np.ndarray, s: np.ndarray, states: np.ndarray, frames: list[int]) -> Point:
-    """A point and what it predicts."""
+    """Return a point with its predictions."""
     states, seen = predict_all(problem.sheet, theta, s, problem.history, states, only=frames)
     return Point(theta=theta, s=s, states=states, seen=seen)
 
 
 def moved(problem: Problem, fitted: Fitted, at: np.ndarray, theta: np.ndarray) -> Point:
-    """A fit's point with other values of some parameters, and what it predicts then."""
+    """Return a fit's point with other values of some parameters, and its predictions."""
     changed = fitted.point.theta.copy()
     changed[at] = theta
     return start(problem, changed, fitted.point.s, fitted.point.states, list(fitted.equations))
@@ -105,67 +110,76 @@ def fit(
     point: Point,
     parts: set[int],
     *,
-    passes: int = PASSES,
+    passes: int = MAX_GAUSS_NEWTON_STEPS,
     log: Callable[[str], None] = lambda _: None,
 ) -> Fitted:
-    """From a point, over the named parameters, the sheet's own and all stiffnesses, to frames of some parts."""
-    now = best = _linearise_at(problem, named, point, problem.frames(parts))
+    """Return the fit of named parameters, nuisance parameters and all stiffnesses to frames of some parts.
+
+    Args:
+        problem: what is fitted to.
+        named: parameters of the effects in the model.
+        point: start of the fit.
+        parts: parts whose frames are fitted to.
+        passes: largest number of Gauss-Newton steps.
+        log: receives progress messages.
+    """
+    now = best = linearise_at(problem, named, point, problem.frames(parts))
     waited = 0
     for count in range(passes):
-        if (better := _better(problem, now, _steps(problem, now))) is None:
+        if (better := better_point(problem, now, candidate_steps(problem, now))) is None:
             break
-        hypothesis, cost = better
-        log(f"pass {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
-        there = _linearise_at(problem, named, hypothesis, problem.frames(parts))
+        next_point, cost = better
+        log(f"step {count + 1}: {now.cost / 2:.1f} -> {cost / 2:.1f} nat")
+        there = linearise_at(problem, named, next_point, problem.frames(parts))
         if not np.isfinite(there.cost):
             break
         now = there
         best, waited = (now, 0) if now.cost < best.cost else (best, waited + 1)
         if waited == PATIENCE:
-            return _to_its_end(problem, best)
-    return _to_its_end(problem, now)
+            return final_step(problem, best)
+    return final_step(problem, now)
 
 
 def without(problem: Problem, fitted: Fitted, part: int) -> Fitted:
-    """One more step from the end of a fit, with the frames of one part left out, by what is known there already.
+    """Return one more step from a fit without the frames of one part, from the normal equations that it has.
 
-    Not to the attachments likeliest together: of many that are as likely, they are some, and fewer frames would take
-    others at random.
+    The likeliest set of attachments is no candidate: of many equally likely sets, fewer frames would take another one
+    at random.
     """
-    left = [k for k in fitted.equations if problem.history.frames[k].part != part]
-    equations, weights = {k: fitted.equations[k] for k in left}, {k: fitted.weights[k] for k in left}
-    now = replace(_found(problem, fitted.named, fitted.point, equations, weights), around=fitted.around)
-    better = _better(problem, now, _steps(problem, now, together=False), least=0.0)
+    kept = [k for k in fitted.equations if problem.history.frames[k].part != part]
+    equations, weights = {k: fitted.equations[k] for k in kept}, {k: fitted.weights[k] for k in kept}
+    now = replace(_fit_at(problem, fitted.named, fitted.point, equations, weights), around=fitted.around)
+    better = better_point(problem, now, candidate_steps(problem, now, likeliest_set=False), min_gain=0.0)
     return now if better is None else replace(now, point=better[0], cost=better[1])
 
 
-def doubted(problem: Problem, fitted: Fitted, excess: float) -> Fitted:
-    """A fit as it is believed where what it never saw is missed by `excess` times the stated variance.
+def discounted(problem: Problem, fitted: Fitted, excess: float) -> Fitted:
+    """Return a fit whose information is divided by the mean squared standardised residual of held-out parts.
 
-    All that its frames say counts by as much less: quasi-likelihood [Wedderburn 1974, doi:10.1093/biomet/61.3.439].
+    This is quasi-likelihood [Wedderburn 1974, doi:10.1093/biomet/61.3.439].
     """
     sd = problem.sd(fitted.named)
     return replace(fitted, summary=_summary(problem, fitted.square / excess, fitted.point, fitted.free, sd))
 
 
 def gains_over(problem: Problem, better: Fitted, plain: Fitted) -> tuple[float, float]:
-    """By how much one fit explains the frames better than another, under its own weights and under the other's [nat].
+    """Return the log likelihood ratio of one fit to another, under its own weights and under the other's [nat].
 
-    Weights of different fits forgive different things, so that gains under one fit's alone do not compare.
+    The weights of different fits tolerate different residuals, so that ratios under one fit's alone do not compare.
     """
     plain_there = _cost(problem, better.weights, plain.point, plain.named)
     better_there = _cost(problem, plain.weights, better.point, better.named)
     return (plain_there - better.cost) / 2, (plain.cost - better_there) / 2
 
 
-def _linearise_at(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> Fitted:
-    """A point with what is known there."""
+def linearise_at(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> Fitted:
+    """Return a point as a fit, with weights, normal equations and posterior there."""
     along = directions(problem, problem.free(named))
     weights = weighed(problem, point, frames)
-    return _found(problem, named, point, linearised(problem, point, weights, along), weights)
+    return _fit_at(problem, named, point, linearised(problem, point, weights, along), weights)
 
 
-def _found(
+def _fit_at(
     problem: Problem, named: np.ndarray, point: Point, equations: dict[int, NormalEquations], weights: dict[int, Metric]
 ) -> Fitted:
     free, sd = problem.free(named), problem.sd(named)
@@ -183,107 +197,112 @@ def _found(
     )
 
 
-def _to_its_end(problem: Problem, now: Fitted) -> Fitted:
-    """One more step of the parameters alone, by what is known there already, however little it promises.
+def final_step(problem: Problem, now: Fitted) -> Fitted:
+    """Return a fit after one more step of the parameters alone, from its normal equations, however small the gain.
 
-    Other attachments that fit about as well may lie far off, where the weights do not hold. What is believed of them is
-    so whatever the parameters are.
+    Other attachments that fit about as well may be far away, where the weights do not hold. The posterior of the
+    attachments stays, because the parameters are marginalised in it.
     """
-    theta, s = _after(problem, now, _at_hand(problem, now), 1.0)
+    theta, s = _apply(problem, now, parameter_step(problem, now), 1.0)
     point = start(problem, theta, s, now.point.states, list(now.equations))
     cost = _cost(problem, now.weights, point, now.named)
     if not cost < now.cost:
         return now
     n = len(s)
-    gone = np.zeros(len(now.equations[min(now.equations)].square))
-    gone[n : n + len(now.free)], gone[-1] = (theta - now.point.theta)[now.free], 1.0
-    equations = {k: _transferred(one, gone) for k, one in now.equations.items()}
+    displacement = np.zeros(len(now.equations[min(now.equations)].square))
+    displacement[n : n + len(now.free)], displacement[-1] = (theta - now.point.theta)[now.free], 1.0
+    equations = {k: recentred(one, displacement) for k, one in now.equations.items()}
     square = reduced(problem, equations, len(now.free))
     return replace(now, point=point, equations=equations, square=square, cost=cost)
 
 
-def _transferred(normal_equations: NormalEquations, gone: Float[np.ndarray, " k"]) -> NormalEquations:
-    """A frame's normal equations about a point that is so far off, 1 at the end, as linear as they are."""
+def recentred(normal_equations: NormalEquations, displacement: Float[np.ndarray, " k"]) -> NormalEquations:
+    """Return a frame's normal equations about a point at a displacement, which ends with 1, by linearity."""
     square, tool = np.array(normal_equations.square), np.array(normal_equations.tool)
-    square[:, -1] = square @ gone
-    square[-1] = gone @ square
-    tool[:, -1] = tool @ gone[-tool.shape[1] :]
+    square[:, -1] = square @ displacement
+    square[-1] = displacement @ square
+    tool[:, -1] = tool @ displacement[-tool.shape[1] :]
     return NormalEquations(square=jnp.asarray(square), tool=jnp.asarray(tool))
 
 
-def _better(problem: Problem, now: Fitted, steps: list[Step], *, least: float = GAIN) -> tuple[Point, float] | None:
-    """A point where the cost is less, and that; None if normal equations promise no more than `least` of it.
+def better_point(
+    problem: Problem, now: Fitted, steps: list[Step], *, min_gain: float = MIN_RELATIVE_GAIN
+) -> tuple[Point, float] | None:
+    """Return a point with a lower cost, and that cost; None if the predicted gain is at most `min_gain` of the cost.
 
-    Of shares of steps the one that promises most is tried first. Samples may ask for stiffnesses that fit worse, where
-    a step of the parameters alone promises more.
+    The share of a step with the largest predicted gain is tried first. The posterior may have stiffnesses that fit
+    worse; a step of the parameters alone then has the larger gain.
     """
-    there = [_after(problem, now, step, share) for step in steps for share in SHORTER]
-    promised = np.array([_promised(problem, now, theta, s) for theta, s in there])
-    for k in np.argsort(-promised, kind="stable"):
-        if promised[k] <= least * now.cost:
+    candidates = [_apply(problem, now, step, share) for step in steps for share in STEP_SHARES]
+    gains = np.array([_predicted_gain(problem, now, theta, s) for theta, s in candidates])
+    for k in np.argsort(-gains, kind="stable"):
+        if gains[k] <= min_gain * now.cost:
             return None
-        theta, s = there[k]
-        hypothesis = start(problem, theta, s, now.point.states, list(now.equations))
-        cost = _cost(problem, now.weights, hypothesis, now.named)
+        theta, s = candidates[k]
+        point = start(problem, theta, s, now.point.states, list(now.equations))
+        cost = _cost(problem, now.weights, point, now.named)
         if cost < now.cost:
-            return hypothesis, cost
+            return point, cost
     return None
 
 
-def _after(problem: Problem, now: Fitted, step: Step, share: float) -> Step:
-    """The parameters and s after a share of a step, as far as they may go."""
+def _apply(problem: Problem, now: Fitted, step: Step, share: float) -> Step:
+    """Return the parameters and s after a share of a step, within their bounds."""
     free, sd = now.free, problem.sd(now.named)
-    most = np.where(np.arange(len(free)) < len(now.named), FARTHEST, OWN_FARTHEST) * sd
+    largest = np.where(np.arange(len(free)) < len(now.named), MAX_EFFECT, MAX_NUISANCE) * sd
     theta = now.point.theta + share * step[0]
-    theta[free] = np.clip(theta[free], np.maximum(problem.least(free), -most), most)
-    return theta, np.clip(now.point.s + share * step[1], 0, STIFFEST)
+    theta[free] = np.clip(theta[free], np.maximum(problem.lower_bounds(free), -largest), largest)
+    return theta, np.clip(now.point.s + share * step[1], 0, MAX_STIFFNESS)
 
 
-def _promised(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"]) -> float:
-    """By how much the cost would be less there, by the normal equations."""
+def _predicted_gain(problem: Problem, now: Fitted, theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"]) -> float:
+    """Return by how much the normal equations predict that the cost is lower there [nat, doubled like the cost]."""
     free, sd, point = now.free, problem.sd(now.named), now.point
-    gone = np.concatenate([s - point.s, (theta - point.theta)[free], [1.0]])
-    less = float(now.square[-1, -1] - gone @ now.square @ gone)
-    return less + _prior(point.theta, point.s, free, sd) - _prior(theta, s, free, sd)
+    displacement = np.concatenate([s - point.s, (theta - point.theta)[free], [1.0]])
+    gain = float(now.square[-1, -1] - displacement @ now.square @ displacement)
+    return gain + _prior(point.theta, point.s, free, sd) - _prior(theta, s, free, sd)
 
 
-def _steps(problem: Problem, now: Fitted, *, together: bool = True) -> list[Step]:
-    """To the s that samples find attached one by one, at the s at hand, and to those likeliest together.
+def candidate_steps(problem: Problem, now: Fitted, *, likeliest_set: bool = True) -> list[Step]:
+    """Return the candidate steps, each with the parameters that fit its s best.
 
-    Each with the parameters that fit it best. Where any of many may carry a load, none of them is likelier attached
-    than not, and yet one must be. Nor is any where a load is lighter than was thought, as all that carry it are softer
-    but none of them by itself: there all s may go by one factor. Elsewhere what fits best so would follow the noise.
+    They are: to the particles that are more likely attached than not; with the current s; and to the likeliest set of
+    attachments. If any of many particles may hold a load, none of them is more likely attached than not, and yet one
+    must be. The same holds if a load is smaller than assumed, because all that hold it are softer, but none of them
+    alone. Only then all s may change by one factor; elsewhere the best factor would follow the noise.
     """
-    found = problem.prior.bounded(jnp.where(now.summary.probability > 0.5, now.summary.b, 0.0))
-    steps = [_towards(problem, now, np.asarray(found)), _at_hand(problem, now)]
+    detected = problem.prior.bounded(jnp.where(now.summary.probability > 0.5, now.summary.b, 0.0))
+    steps = [_towards(problem, now, np.asarray(detected)), parameter_step(problem, now)]
     if not now.attached.any():
-        steps.append(_by_one_factor(problem, now))
-    return [*steps, _towards(problem, now, np.asarray(likeliest(now.belief)))] if together else steps
+        steps.append(common_factor_step(problem, now))
+    return [*steps, _towards(problem, now, np.asarray(likeliest(now.belief)))] if likeliest_set else steps
 
 
-def _at_hand(problem: Problem, now: Fitted) -> Step:
-    """Of the parameters alone."""
+def parameter_step(problem: Problem, now: Fitted) -> Step:
+    """Return the step of the parameters alone."""
     return _towards(problem, now, now.point.s)
 
 
-def _by_one_factor(problem: Problem, now: Fitted) -> Step:
-    """To all s at hand times what fits best, whatever the parameters are."""
-    s, told = now.point.s, now.belief
-    factor = (s @ np.asarray(told.shift) + LEAST) / (s @ np.asarray(told.precision) @ s + LEAST)
+def common_factor_step(problem: Problem, now: Fitted) -> Step:
+    """Return the step of all s by the common factor that fits best, with the parameters marginalised."""
+    s, belief = now.point.s, now.belief
+    factor = (s @ np.asarray(belief.shift) + FACTOR_PRECISION) / (
+        s @ np.asarray(belief.precision) @ s + FACTOR_PRECISION
+    )
     return _towards(problem, now, factor * s)
 
 
 def _towards(problem: Problem, now: Fitted, to: Float[np.ndarray, " n"]) -> Step:
-    """To some s, with the parameters that fit it best."""
+    """Return the step to a given s, with the parameters that fit it best."""
     point, free, sd = now.point, now.free, problem.sd(now.named)
     best = _joint(now.square, point, free, sd).condition(s=to - point.s).mean()
     theta = np.zeros(len(point.theta))
-    theta[free] = np.clip(best, -FAR * sd, FAR * sd)
+    theta[free] = np.clip(best, -MAX_CHANGE * sd, MAX_CHANGE * sd)
     return theta, to - point.s
 
 
 def _summary(problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> PosteriorSummary:
-    """What is believed of the attachments there, the parameters marginalised."""
+    """Return the posterior of the attachments at a point, with the parameters marginalised."""
     step = _joint(square, point, free, sd).marginal("s")
     shift = step.precision @ point.s + step.shift
     return quick_summary(problem.prior.add(jnp.asarray(step.precision), jnp.asarray(shift)))
@@ -296,11 +315,11 @@ def _joint(square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -
 
 
 def _cost(problem: Problem, weights: dict[int, Metric], point: Point, named: np.ndarray) -> float:
-    """Of a point with those parameters free, under weights that may have been reckoned elsewhere; see `Fitted.cost`."""
+    """Return the cost of a point under weights that may be of another point; see `Fitted.cost`."""
     prior = _prior(point.theta, point.s, problem.free(named), problem.sd(named))
     return cost_under(problem, weights, point) + prior
 
 
 def _prior(theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"], free: np.ndarray, sd: np.ndarray) -> float:
-    """Twice the logarithm of the prior, its constants left out."""
-    return 2 * ODDS * float(np.sum(s > 0)) + float(np.sum((theta[free] / sd) ** 2))
+    """Return twice the negative logarithm of the prior, without constants."""
+    return 2 * ATTACHMENT_LOG_ODDS * float(np.sum(s > 0)) + float(np.sum((theta[free] / sd) ** 2))

@@ -1,4 +1,4 @@
-"""How well frames are foretold that a fit never saw, from what the tool says alone."""
+"""Held-out prediction: predict frames that a fit never saw, from the tool's reports alone."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,93 +18,101 @@ from .linear import Metric
 from .problem import Point, Problem
 from .sheet import predict_all
 
-ROUNDS = 2
-"""Passes over a grasp, so that its frames know the states of those before."""
-PINNED = 1e6
-"""Stiffness that stands for what is held [N/m]."""
+N_PASSES = 2
+"""Passes over a grasp, so that each frame's context has the predicted states of those before."""
+HELD_STIFFNESS = 1e6
+"""Stiffness that fixes what is held [N/m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOut:
-    """A grasp's frames, particles that were seen and not held."""
+    """Held-out prediction of a part, for particles that are observed and not held."""
 
-    off: Float[np.ndarray, "m 3"]
-    """Seen less foretold [m]."""
-    reckon: Callable[[], Float[np.ndarray, "m 3"]]
-    """What makes `sd`, which costs more than all the rest."""
+    residual: Float[np.ndarray, "m 3"]
+    """Observed minus predicted positions [m]."""
+    compute_sd: Callable[[], Float[np.ndarray, "m 3"]]
+    """Function that computes `sd`, which costs more than all the rest."""
 
     @cached_property
     def sd(self) -> Float[np.ndarray, "m 3"]:
-        """Of what is off, as the fit has it [m]."""
-        return self.reckon()
+        """Return the standard deviation of the residual under the fit [m]."""
+        return self.compute_sd()
 
     @property
     def rms(self) -> float:
-        """Root mean square distance [m]."""
-        return rms(self.off)
+        """Return the root mean square distance [m]."""
+        return rms(self.residual)
 
     @property
     def excess(self) -> float:
-        """Mean square of the error in standard deviations: 1 where the fit knows how well it foretells."""
-        return float(np.mean((self.off / self.sd) ** 2))
+        """Return the mean squared standardised residual: 1 if the fit states its errors correctly."""
+        return float(np.mean((self.residual / self.sd) ** 2))
 
     @property
     def nll(self) -> float:
-        """Mean negative log likelihood of a coordinate [nat, lengths in m]."""
-        return float(np.mean(0.5 * (self.off / self.sd) ** 2 + np.log(self.sd) + 0.5 * np.log(2 * np.pi)))
+        """Return the mean negative log likelihood of a coordinate [nat, lengths in m]."""
+        return float(np.mean(0.5 * (self.residual / self.sd) ** 2 + np.log(self.sd) + 0.5 * np.log(2 * np.pi)))
 
     @property
     def coverage_90(self) -> float:
-        """Share of coordinates within their 90 % intervals."""
-        return float(np.mean(np.abs(self.off) <= norm.ppf(0.95) * self.sd))
+        """Return the share of coordinates within their 90 % intervals."""
+        return float(np.mean(np.abs(self.residual) <= norm.ppf(0.95) * self.sd))
 
     @staticmethod
     def together(parts: list["HeldOut"]) -> "HeldOut":
-        """Several grasps."""
+        """Return the predictions of several parts as one."""
         return HeldOut(
-            off=np.concatenate([one.off for one in parts]), reckon=lambda: np.concatenate([one.sd for one in parts])
+            residual=np.concatenate([part.residual for part in parts]),
+            compute_sd=lambda: np.concatenate([part.sd for part in parts]),
         )
 
 
 def held_out(problem: Problem, fits: dict[int, Fitted]) -> list[HeldOut]:
-    """Each part by the fit without it."""
+    """Return the prediction of each part by the fit without it."""
     return list(parallel_map(lambda part: predict_held_out(problem, fits[part], part), fits).values())
 
 
 def predict_held_out(problem: Problem, fitted: Fitted, part: int) -> HeldOut:
-    """One part that was not fitted to."""
+    """Return the prediction of one part that was not fitted to."""
     frames = problem.frames({part})
-    anew, closed = from_rest(problem, fitted.point, frames, by_tool=True), problem.history.frames
+    predicted, closed = from_rest(problem, fitted.point, frames, by_tool=True), problem.history.frames
 
     def sd() -> Float[np.ndarray, "m 3"]:
-        weights, known = weighed(problem, anew, frames), _covariance(problem, fitted)
+        weights, known = weighed(problem, predicted, frames), _covariance(problem, fitted)
 
         def one(k: int) -> Float[np.ndarray, "n 3"]:
-            return _sd(problem, weights[k], closed[k].frame, known, jnp.asarray(anew.states[k]))
+            return _sd(problem, weights[k], closed[k].frame, known, jnp.asarray(predicted.states[k]))
 
         every = parallel_map(one, frames)
         return np.concatenate([every[k][np.asarray(closed[k].frame.counted)] for k in frames])
 
-    return HeldOut(off=off(problem, anew, frames), reckon=sd)
+    return HeldOut(residual=residuals(problem, predicted, frames), compute_sd=sd)
 
 
-def off(problem: Problem, point: Point, frames: list[int]) -> Float[np.ndarray, "m 3"]:
-    """Seen less predicted of some frames, of the particles that are counted [m]."""
+def residuals(problem: Problem, point: Point, frames: list[int]) -> Float[np.ndarray, "m 3"]:
+    """Return observed minus predicted positions of some frames, for observed particles that are not held [m]."""
     closed = [(problem.history.frames[k].frame, point.seen[k]) for k in frames]
     return np.concatenate([(np.asarray(frame.y) - seen)[np.asarray(frame.counted)] for frame, seen in closed])
 
 
-def rms(off: Float[np.ndarray, "m 3"]) -> float:
-    """Root mean square distance [m]."""
-    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+def rms(residual: Float[np.ndarray, "m 3"]) -> float:
+    """Return the root mean square length of residuals [m]."""
+    return float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
 
 
 def from_rest(problem: Problem, point: Point, frames: list[int], *, by_tool: bool) -> Point:
-    """Some frames predicted anew, searched from rest; what is held goes as the tool says, or as it was seen."""
+    """Return a point with some frames predicted again, searched from rest.
+
+    Args:
+        problem: has the frames.
+        point: parameters and stiffnesses.
+        frames: frames to predict.
+        by_tool: whether what is held moves as the tool reports; if not, as observed.
+    """
     again = np.isin(np.arange(len(point.states)), frames)[:, None, None]
     states = np.where(again, np.asarray(problem.history.rest)[None], point.states)
     seen = states
-    for _ in range(ROUNDS):
+    for _ in range(N_PASSES):
         states, seen = predict_all(
             problem.sheet, point.theta, point.s, problem.history, states, only=frames, by_tool=by_tool
         )
@@ -112,7 +120,7 @@ def from_rest(problem: Problem, point: Point, frames: list[int], *, by_tool: boo
 
 
 def _covariance(problem: Problem, fitted: Fitted) -> Float[np.ndarray, "n n"]:
-    """Of a fit's s."""
+    """Return the covariance of a fit's s."""
     n, d = len(fitted.site_precision), len(fitted.free)
     joint = GaussianInformation.from_normal_equations(fitted.square, s=n, theta=d)
     joint = joint.with_independent("s", fitted.site_precision)
@@ -122,14 +130,14 @@ def _covariance(problem: Problem, fitted: Fitted) -> Float[np.ndarray, "n n"]:
 def _sd(
     problem: Problem, metric: Metric, seen: ClosedFrame, known: Float[np.ndarray, "n n"], x: Float[Array, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Of what is seen of each particle: the noise, the forces that the model gets wrong, and s."""
+    """Return the sd of each observed coordinate [m]: from noise, force errors of the model, and the covariance of s."""
     n, frame, held = len(x), metric.frame, np.asarray(seen.held)
     rows = np.zeros((n + 1, 3, n + 1, 3))
     neighbours = np.asarray(metric.balance.neighbours)
     rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(np.asarray(frame.dr_dx), 2, 3).swapaxes(2, 3)
     H = rows[:n, :, :n].reshape(3 * n, 3 * n)
     H[np.repeat(held, 3)] = 0.0
-    H[np.repeat(held, 3), np.repeat(held, 3)] = PINNED
+    H[np.repeat(held, 3), np.repeat(held, 3)] = HELD_STIFFNESS
     inverse = np.linalg.inv(H)
     force = np.where(held, 0.0, np.asarray(problem.sheet.balance.error(x)))
     wrong = np.sum((inverse.reshape(3 * n, n, 3) * force[None, :, None]) ** 2, axis=(1, 2))

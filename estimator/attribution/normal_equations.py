@@ -1,4 +1,4 @@
-"""Frames' normal equations added up, with what is common to a grasp eliminated."""
+"""Sums of the frames' normal equations, with what is common to a grasp eliminated."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,11 +9,11 @@ from .linear import N_FIELDS, NormalEquations, grasp_sd, tool_sd
 from .problem import Problem
 
 FIELDS = slice(-1 - N_FIELDS, -1)
-"""Where the smooth force fields are in a frame's normal equations."""
+"""Place of the smooth force fields in a frame's normal equations."""
 
 
 def reduced(problem: Problem, equations: dict[int, NormalEquations], d: int) -> Float[np.ndarray, "k k"]:
-    """Over s, the first d directions and -1."""
+    """Return the normal equations of all frames over s, the first d directions and -1."""
     total: np.ndarray | float = 0.0
     for frames in problem.by_part(equations).values():
         whole = np.sum([np.asarray(equations[k].square) for k in frames], axis=0)
@@ -37,7 +37,10 @@ def without_stiffnesses(
 
 
 def less_offset(rows: Float[np.ndarray, "t 3 a"], frame: ClosedFrame) -> Float[np.ndarray, "a a"]:
-    """Products of the tool's rows over a grasp's frames, such as `frame`, an offset common to them eliminated."""
+    """Return the inner products of the tool's rows over a grasp's frames, with their common offset eliminated.
+
+    `frame` is one of them, and gives the standard deviations.
+    """
     ratio = float(grasp_sd(frame) / tool_sd(frame)) ** 2
     share, together = ratio / (1 + ratio * len(rows)), rows.sum(0)
     return np.einsum("tia,tib->ab", rows, rows) - share * np.einsum("ia,ib->ab", together, together)

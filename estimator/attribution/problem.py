@@ -1,4 +1,4 @@
-"""What a loop is closed over: the sheet, its frames, the noise, and what is believed beforehand."""
+"""The problem that effects are fitted to: the sheet, its frames, the noise, and the priors."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -25,33 +25,39 @@ NUISANCE = {
     "image_latency": (0.02,),
     "surface_height": (5e-4,),
 }
-"""What may be a little off in any sheet, and is no effect: standard deviations in the effects' units."""
+"""Nuisance parameters, which may differ a little from 0 in any sheet: prior standard deviations in the effects'
+units."""
 FORCE_VARIANCE = 0.04
-"""Share of the filter's force variance that is left when what is the same in all frames of a grasp goes to smooth force
-fields: the likeliest on recordings of the reference with nothing undeclared in them."""
+"""Share of the filter's force variance that remains once smooth force fields hold what is the same in all frames of a
+grasp. Measured: the likeliest on recordings of the reference with nothing undeclared."""
 AMPLITUDE = 0.2
-"""Of those fields, in units of the force error; the likeliest on the same."""
+"""Standard deviation of the smooth force fields [force errors]; the likeliest on the same recordings."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """What is fitted to."""
+    """Everything that a fit needs besides its start."""
 
     sheet: PredictedSheet
+    """Sheet with all effects of the library."""
     history: FrameHistory
+    """All frames."""
     prior: AttachmentBelief
+    """Prior of the attachments."""
     noise: Float[np.ndarray, "n modes"]
-    """Smooth fields of what is seen [m]."""
+    """Fields of the smooth noise of observed positions [m]."""
     prior_sd: Float[np.ndarray, " p"]
-    """Of all the library's parameters, where they are an effect's."""
+    """Prior standard deviations of all the library's parameters as effects."""
     own: np.ndarray
-    """Parameters that are free in any case."""
+    """Nuisance parameters, which are free in all fits."""
     own_sd: Float[np.ndarray, " own"]
+    """Prior standard deviations of the nuisance parameters."""
     amplitude: float = AMPLITUDE
+    """Standard deviation of the smooth force fields [force errors]."""
 
     @classmethod
     def build(cls, dataset: Dataset, library: tuple[Effect, ...]) -> "Problem":
-        """For a recording and what the model may lack."""
+        """Return the problem for a recording and the effects that the model may lack."""
         estimator = dataset.estimator
         mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
         energy = nominal_energy(mesh, estimator.declaration)
@@ -69,42 +75,43 @@ class Problem:
             own_sd=np.concatenate([[], *(np.asarray(sd) for sd in own.values())]),
         )
 
-    def widened(self, variance: float, amplitude: float) -> "Problem":
-        """With that many times the variance of the forces, and smooth fields of another amplitude."""
+    def inflated(self, variance: float, amplitude: float) -> "Problem":
+        """Return the problem with the forces' variance multiplied, and another amplitude of the smooth fields."""
         sheet = eqx.tree_at(lambda one: one.balance, self.sheet, self.sheet.balance.inflated(variance))
         return replace(self, sheet=sheet, amplitude=amplitude)
 
     def frames(self, parts: Iterable[int]) -> list[int]:
-        """Frames of some parts."""
+        """Return the frames of some parts."""
         return [k for k, one in enumerate(self.history.frames) if one.part in set(parts)]
 
     def by_part(self, frames: Iterable[int]) -> dict[int, list[int]]:
-        """Frames sorted by part."""
+        """Return frames grouped by part."""
         return self.history.by(lambda one: one.part, frames)
 
     def free(self, named: np.ndarray) -> np.ndarray:
-        """Named parameters, and the sheet's own."""
+        """Return the indices of named parameters, then of the other nuisance parameters."""
         return np.concatenate([named, [k for k in self.own if k not in named]]).astype(int)
 
     def sd(self, named: np.ndarray) -> Float[np.ndarray, " free"]:
-        """Prior standard deviations of `free`."""
+        """Return the prior standard deviations of the parameters `free(named)`."""
         narrow = [sd for k, sd in zip(self.own, self.own_sd, strict=True) if k not in named]
         return np.concatenate([self.prior_sd[named], narrow])
 
-    def least(self, free: np.ndarray) -> Float[np.ndarray, " free"]:
-        """The least that each may be."""
+    def lower_bounds(self, free: np.ndarray) -> Float[np.ndarray, " free"]:
+        """Return the lower bound of each parameter."""
         lowest = [np.full(one.size, 0.0 if one.non_negative else -np.inf) for one in self.sheet.library]
         return np.concatenate(lowest)[free]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """Where a fit is."""
+    """Parameters of a fit with the predicted states."""
 
     theta: Float[np.ndarray, " p"]
+    """All parameters of the library."""
     s: Float[np.ndarray, " n"]
     """Bounded stiffnesses."""
     states: Float[np.ndarray, "frames n 3"]
-    """As predicted [m]."""
+    """Predicted states [m]."""
     seen: Float[np.ndarray, "frames n 3"]
-    """The same as the camera shows it; NaN in frames that were not predicted."""
+    """Predicted observations [m]; NaN in frames that were not predicted."""

@@ -1,12 +1,11 @@
-"""Which effects a fit's misfit looks like: score statistics at the fit, with all that may vary anyway marginalised.
+"""Score statistics of all effects at a fit, with stiffnesses, nuisance parameters and smooth fields marginalised.
 
-With V the information about an effect's parameters that is left when stiffnesses, the sheet's own parameters and smooth
-force fields are marginalised, g its score and theta ~ N(0, Theta) before,
+With V the marginal information about an effect's parameters, g its score and the prior theta ~ N(0, Theta),
 
     ln BF = g^T (V + Theta^-1)^-1 g / 2 - ln |I + Theta V| / 2
 
-for each place where it may be, and the mean of the BFs over the places. An effect that shows little of itself in its
-derivatives at 0 is also tried from its natural size, with a few steps of a fit.
+for each site, and the mean of the Bayes factors over the sites. An effect whose derivatives at 0 show little of it is
+also fitted from its initial guesses, for a few steps.
 """
 
 from dataclasses import dataclass, replace
@@ -22,40 +21,45 @@ from .fit import Fitted, fit, gains_over, moved
 from .normal_equations import reduced, without_stiffnesses
 from .problem import Point, Problem
 
-STEPS = 2
-"""Of a fit from an effect's natural size."""
-HOPELESS = 4.0
-"""How many times the cost without it may be missed at that size before it is not tried."""
+INITIAL_GUESS_STEPS = 2
+"""Gauss-Newton steps of a fit from an initial guess of an effect."""
+MAX_START_COST = 4.0
+"""Largest cost at an initial guess with which the fit is tried [costs without the effect]."""
+SINGULAR = 1e-9
+"""Share of the trace that is added to an information matrix before it is inverted: some directions have none."""
+MIN_TRACE = 1e-30
+"""Trace that a smaller one is taken as, so that an effect without any information has a finite inverse."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Of one effect."""
+    """Score of one effect."""
 
     name: str
+    """Name of the effect."""
     log_bayes_factor: float
-    """Against its absence, linearly; or from its natural size, where that is more."""
+    """Log Bayes factor against its absence, linearised at 0; or from an initial guess, if that is larger [nat]."""
     site: int
-    """Where it is likeliest."""
+    """Likeliest site."""
     theta: Float[np.ndarray, " p"]
-    """By how much its parameters there would change, in that step."""
+    """Change of its parameters at that site in a linear step."""
     p_value: float
-    """Of the score statistic where the effect is absent, for the best of all its places; of the likelihood ratio, where
-    it was tried from its natural size."""
+    """P-value of the score statistic if the effect is absent, for the best of all sites; of the likelihood ratio for a
+    fit from an initial guess."""
     began: Point | None = None
-    """Where a fit with it may begin, if not with that step."""
+    """Start of a fit with the effect; None for the linear step."""
     kept: float
-    """Share of the information about it that is left in the worst direction when the rest is marginalised, at 0."""
+    """Share of the information about it that is left after marginalising, at 0, in the worst direction."""
 
 
 def scores(problem: Problem, fitted: Fitted) -> list[Score]:
-    """Every effect of the library that was not fitted already, the likeliest first."""
+    """Return the scores of all effects that are not in the fit, the likeliest first."""
     n, every = len(fitted.site_precision), directions(problem, np.arange(problem.sheet.size))
     equations = linearised(problem, fitted.around, fitted.weights, every)
     square = reduced(problem, equations, problem.sheet.size)
     left, whole = without_stiffnesses(square, fitted.site_precision), square[n:, n:]
     found = [
-        _best([_one(problem, fitted, effect, site, left, whole) for site in range(effect.sites)])
+        _over_sites([_score(problem, fitted, effect, site, left, whole) for site in range(effect.sites)])
         for effect in problem.sheet.library
         if not np.isin(problem.sheet.place(effect.name), fitted.named).any()
     ]
@@ -63,7 +67,7 @@ def scores(problem: Problem, fitted: Fitted) -> list[Score]:
 
 
 def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " named"]]:
-    """Ln |I + Theta V| / 2 of a fit's named parameters, and their standard deviations."""
+    """Return ln |I + Theta V| / 2 of the effects' parameters in a fit, and their standard deviations."""
     if not len(fitted.named):
         return 0.0, np.zeros(0)
     d, sd = len(fitted.named), problem.sd(fitted.named)
@@ -74,9 +78,10 @@ def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " 
 
 
 def bayes_factor(problem: Problem, better: Fitted, plain: Fitted, sites: int) -> tuple[float, float]:
-    """By how much a fit is likelier than another, and ln BF: less what its effect at one of `sites` costs [nat].
+    """Return the log likelihood ratio of two fits, and the log Bayes factor [nat].
 
-    Of a fit that cannot be weighed both are minus infinity.
+    The latter has the Occam factor of the parameters, and of the choice among `sites`. Both are minus infinity for a
+    fit whose cost is not finite.
     """
     if not np.isfinite(better.cost):
         return -np.inf, -np.inf
@@ -84,10 +89,10 @@ def bayes_factor(problem: Problem, better: Fitted, plain: Fitted, sites: int) ->
     return likelier, float(likelier - (occam(problem, better)[0] - occam(problem, plain)[0]) - np.log(sites))
 
 
-def _one(
+def _score(
     problem: Problem, fitted: Fitted, effect: Effect, site: int, left: GaussianInformation, whole: np.ndarray
 ) -> Score:
-    """Return the score at one place, from the information with s marginalised, and the products of all columns."""
+    """Return the score at one site, from the information with s marginalised, and the products of all columns."""
     mine = problem.sheet.place(effect.name, site)
     others = ~np.isin(fitted.free, mine)
     rest, sd_rest = fitted.free[others], problem.sd(fitted.named)[others]
@@ -99,10 +104,10 @@ def _one(
     theta = posterior.mean()
     senseless = effect.non_negative and theta[0] < 0
     evidence = (0.0 if senseless else 0.5 * scaled @ theta) - 0.5 * posterior.log_det()
-    faint = 1e-9 * max(float(np.trace(unit)), 1e-30)
-    statistic = float(scaled @ np.linalg.solve(unit + faint * eye, scaled))
+    regularisation = SINGULAR * max(float(np.trace(unit)), MIN_TRACE)
+    statistic = float(scaled @ np.linalg.solve(unit + regularisation * eye, scaled))
     raw = whole[np.ix_(mine, mine)] * np.outer(sd, sd)
-    kept = np.linalg.eigvals(np.linalg.solve(raw + 1e-9 * max(np.trace(raw), 1e-30) * eye, unit)).real.min()
+    kept = np.linalg.eigvals(np.linalg.solve(raw + SINGULAR * max(np.trace(raw), MIN_TRACE) * eye, unit)).real.min()
     return Score(
         name=effect.name,
         log_bayes_factor=float(evidence),
@@ -114,18 +119,18 @@ def _one(
 
 
 def _from_initial_guesses(problem: Problem, fitted: Fitted, score: Score) -> Score:
-    """An effect's score, or that of a few steps from its natural size, where that is more."""
+    """Return an effect's score, or that of a few steps from its best initial guess, if that is larger."""
     effect = problem.sheet.effect(score.name)
     if not effect.initial_guesses:
         return score
     at = problem.sheet.place(effect.name, score.site)
     parts = {problem.history.frames[k].part for k in fitted.equations}
-    begun = [moved(problem, fitted, at, np.array(one)) for one in effect.initial_guesses]
-    costs = [cost_under(problem, fitted.weights, point) for point in begun]
-    if min(costs) > HOPELESS * fitted.cost:
+    starts = [moved(problem, fitted, at, np.array(guess)) for guess in effect.initial_guesses]
+    costs = [cost_under(problem, fitted.weights, point) for point in starts]
+    if min(costs) > MAX_START_COST * fitted.cost:
         return score
-    best = begun[int(np.argmin(costs))]
-    found = fit(problem, np.append(fitted.named, at), best, parts, passes=STEPS)
+    best = starts[int(np.argmin(costs))]
+    found = fit(problem, np.append(fitted.named, at), best, parts, passes=INITIAL_GUESS_STEPS)
     likelier, gain = bayes_factor(problem, found, fitted, effect.sites)
     if gain <= score.log_bayes_factor:
         return score
@@ -138,7 +143,8 @@ def _from_initial_guesses(problem: Problem, fitted: Fitted, score: Score) -> Sco
     )
 
 
-def _best(sites: list[Score]) -> Score:
+def _over_sites(sites: list[Score]) -> Score:
+    """Return the score of the best site, with the mean Bayes factor and the p-value of all sites."""
     evidence = np.array([one.log_bayes_factor for one in sites])
     best = sites[int(np.argmax(evidence))]
     mean = best.log_bayes_factor + float(np.log(np.mean(np.exp(evidence - evidence.max()))))

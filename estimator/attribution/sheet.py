@@ -1,4 +1,4 @@
-"""The sheet with all effects of a library in it: where it goes and how that is seen."""
+"""Predict the sheet with all effects of a library: its equilibria, and how they are observed."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,111 +14,120 @@ from ..physics.energy import SheetEnergy
 from ..physics.membrane import TriangleMembrane
 from .closed_frames import ClosedFrame, FrameHistory
 
-GRIPPED = 1e6
-"""Precision with which the grip carries what it holds while a state is predicted [1/m^2]."""
-
-ROUNDS, STAYS = 4, 1e-5
-"""How often a frame is predicted at most with an effect that lingers, and how little it moves when it stays [m]."""
+GRIP_PRECISION = 1e6
+"""Precision of the held particles' positions while a state is predicted [1/m^2]."""
+MAX_PREDICTIONS = 4
+"""Largest number of predictions of a frame with a history-dependent effect, each from the state of the one before."""
+CONVERGED = 1e-5
+"""Largest change of a position [m] with which such a frame has converged."""
 
 
 class PredictedSheet(eqx.Module):
-    """One sheet and what it may lack."""
+    """A declared sheet with the effects that it may lack."""
 
     balance: ForceBalance
+    """Force balance of the declared sheet."""
     view: View
+    """View without effects."""
     library: tuple[Effect, ...] = eqx.field(static=True)
+    """Effects, which act on the model in this order."""
 
     @property
     def size(self) -> int:
-        """How many parameters the library has."""
+        """Return the number of parameters of the library."""
         return sum(effect.size for effect in self.library)
 
     def effect(self, name: str) -> Effect:
-        """The library's effect of a name."""
-        return next(one for one in self.library if one.name == name)
+        """Return the library's effect of a name."""
+        return next(effect for effect in self.library if effect.name == name)
 
     def place(self, name: str, site: int | None = None) -> np.ndarray:
-        """Where an effect's parameters are, at one site or at all."""
+        """Return the indices of an effect's parameters, at one site or at all.
+
+        Raises:
+            ValueError: there is no such effect.
+        """
         start = 0
         for effect in self.library:
             if effect.name == name:
                 at = np.arange(start, start + effect.size)
                 return at if site is None else at.reshape(effect.sites, -1)[site]
             start += effect.size
-        raise ValueError(f"there is no effect {name!r}; there are {[one.name for one in self.library]}.")
+        raise ValueError(f"there is no effect {name!r}; there are {[effect.name for effect in self.library]}.")
 
-    def plain(self, moment: FrameContext, way: Float[Array, " 3"]) -> SheetModel:
-        """Of one frame, without any."""
-        return SheetModel(energy=self.balance.energy, tool=way, view=self.view, time=moment.time)
+    def plain(self, context: FrameContext, tool: Float[Array, " 3"]) -> SheetModel:
+        """Return the model of one frame without effects; `tool` is the reported displacement [m]."""
+        return SheetModel(energy=self.balance.energy, tool=tool, view=self.view, time=context.time)
 
-    def model(self, theta: Float[Array, " p"], moment: FrameContext, way: Float[Array, " 3"]) -> SheetModel:
-        """Of one frame, with effects of those sizes."""
-        model, start = self.plain(moment, way), 0
+    def model(self, theta: Float[Array, " p"], context: FrameContext, tool: Float[Array, " 3"]) -> SheetModel:
+        """Return the model of one frame with effects of parameters theta; `tool` is the reported displacement [m]."""
+        model, start = self.plain(context, tool), 0
         for effect in self.library:
-            model = effect.acts(model, theta[start : start + effect.size], moment)
+            model = effect.acts(model, theta[start : start + effect.size], context)
             start += effect.size
         return model
 
     def balance_of(self, energy: SheetEnergy) -> ForceBalance:
-        """The balance of forces for a changed energy."""
+        """Return the force balance with a changed energy."""
         springs = self.balance.tethered.energy.terms[-1]
         changed = energy, energy.rest, (*energy.terms, springs)
         return eqx.tree_at(lambda b: (b.energy, b.tethered.energy.rest, b.tethered.energy.terms), self.balance, changed)
 
 
 def look(model: SheetModel, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Where particles at x are seen."""
+    """Return where particles at x are observed [m]."""
     return model.view(x, tangents=tangents(model.term(TriangleMembrane), x))
 
 
 def closed_on(
-    sheet: PredictedSheet, theta: Float[Array, " p"], frame: ClosedFrame, moment: FrameContext
+    sheet: PredictedSheet, theta: Float[Array, " p"], frame: ClosedFrame, context: FrameContext
 ) -> Float[Array, "n 3"]:
-    """Where the jaws closed on the held particles, the errors that the view had then taken off [m]."""
-    then = (moment.time - moment.closed, jnp.zeros_like(moment.closed))
-    model = sheet.model(theta, eqx.tree_at(lambda m: (m.time, m.closed), moment, then), frame.way)
-    along = tangents(model.term(TriangleMembrane), moment.rest)
-    slid = model.view.followed(moment.rest, along) - moment.rest
+    """Return where the jaws closed on the held particles, with the view's errors of that time removed [m]."""
+    at_closing = (context.time - context.closed, jnp.zeros_like(context.closed))
+    model = sheet.model(theta, eqx.tree_at(lambda m: (m.time, m.closed), context, at_closing), frame.displacement)
+    along = tangents(model.term(TriangleMembrane), context.rest)
+    slid = model.view.points(context.rest, along) - context.rest
     return 2 * frame.rotated - model.view.moved(frame.rotated + slid)
 
 
-def beyond_tool(
+def tool_residual(
     sheet: PredictedSheet,
     model: SheetModel,
     theta: Float[Array, " p"],
     frame: ClosedFrame,
-    moment: FrameContext,
+    context: FrameContext,
     x: Float[Array, "n 3"],
 ) -> Float[Array, " 3"]:
-    """By how much the held particles have gone further than the tool [m].
+    """Return the displacement of the held particles minus that of the tool [m].
 
-    0 where it says nothing: of its own, or yet, as the jaws have just closed.
+    It is 0 where the tool gives no information: if its report is derived from the points, or the jaws have just closed.
     """
-    further = held_way(model, frame, closed_on(sheet, theta, frame, moment), x) - model.tool
-    return jnp.where(frame.by_points | (moment.closed <= 0), 0.0, further)
+    residual = held_displacement(model, frame, closed_on(sheet, theta, frame, context), x) - model.tool
+    return jnp.where(frame.by_points | (context.closed <= 0), 0.0, residual)
 
 
-def held_way(
+def held_displacement(
     model: SheetModel, frame: ClosedFrame, closed: Float[Array, "n 3"], x: Float[Array, "n 3"]
 ) -> Float[Array, " 3"]:
-    """How far the held particles have gone as seen, the view's errors taken off [m]; as the tool says if none is."""
-    gone = mean_of_held(frame, x + frame.y - look(model, x) - closed)
-    return jnp.where(jnp.any(frame.held & frame.visible), gone, model.tool)
+    """Return the displacement of the held particles without the view's errors [m]; the tool's if none is observed."""
+    displacement = mean_of_held(frame, x + frame.y - look(model, x) - closed)
+    return jnp.where(jnp.any(frame.held & frame.visible), displacement, model.tool)
 
 
 def mean_of_held(frame: ClosedFrame, values: Float[Array, "n ..."]) -> Float[Array, "..."]:
-    """Over the held particles that are seen; zero if there are none."""
+    """Return the mean over the held particles that are observed; zero if there are none."""
     both = frame.held & frame.visible
     among = jnp.expand_dims(both, tuple(range(1, values.ndim)))
     return jnp.sum(jnp.where(among, values, 0.0), axis=0) / jnp.maximum(jnp.sum(both, dtype=float), 1.0)
 
 
 class Predicted(eqx.Module):
-    """One frame."""
+    """Prediction of one frame."""
 
     x: Float[Array, "n 3"]
+    """Positions [m]."""
     seen: Float[Array, "n 3"]
-    """x as the camera shows it."""
+    """Observation of x [m]."""
 
 
 @eqx.filter_jit
@@ -127,19 +136,19 @@ def predict(
     theta: Float[Array, " p"],
     s: Float[Array, " n"],
     frame: ClosedFrame,
-    moment: FrameContext,
+    context: FrameContext,
     start: Float[Array, "n 3"],
     by_tool: Bool[Array, ""],
 ) -> Predicted:
-    """The equilibrium, searched from `start`; what is held goes where it was seen, or where the tool says."""
-    model = sheet.model(theta, moment, frame.way)
-    closed = closed_on(sheet, theta, frame, moment)
-    told = by_tool & ~frame.by_points
-    to = closed + jnp.where(told, model.tool, held_way(model, frame, closed, start))[None]
-    precision = jnp.broadcast_to(GRIPPED * jnp.eye(3)[None], (len(s), 3, 3))
-    gripped = Evidence(y=to, precision=precision, held=frame.held, force_unknown=frame.force_unknown)
-    begun = jnp.where(frame.held[:, None], to, start)
-    x = sheet.balance_of(model.energy).predict(begun, s, gripped)
+    """Return the equilibrium, searched from `start`; what is held moves as observed, or as the tool reports."""
+    model = sheet.model(theta, context, frame.displacement)
+    closed = closed_on(sheet, theta, frame, context)
+    use_tool = by_tool & ~frame.by_points
+    to = closed + jnp.where(use_tool, model.tool, held_displacement(model, frame, closed, start))[None]
+    precision = jnp.broadcast_to(GRIP_PRECISION * jnp.eye(3)[None], (len(s), 3, 3))
+    grip = Evidence(y=to, precision=precision, held=frame.held, force_unknown=frame.force_unknown)
+    begin = jnp.where(frame.held[:, None], to, start)
+    x = sheet.balance_of(model.energy).predict(begin, s, grip)
     return Predicted(x=x, seen=look(model, x))
 
 
@@ -152,30 +161,44 @@ def predict_all(
     *,
     only: list[int] | None = None,
     by_tool: bool = False,
+    max_predictions: int = MAX_PREDICTIONS,
 ) -> tuple[Float[np.ndarray, "frames n 3"], Float[np.ndarray, "frames n 3"]]:
-    """Every frame, and how it is seen, NaN where it was not predicted.
+    """Return the predicted states of all frames [m], and their observations, NaN where not predicted.
 
-    Those of a grasp in turn, from the states known so far, and the grasps side by side: of other grasps an effect knows
-    `states`, not what is found here.
+    The frames of a grasp are predicted in order, each from the states so far. Grasps are predicted in parallel: for
+    other grasps an effect has `states`, not the predictions of this call.
+
+    Args:
+        sheet: predicts each frame.
+        theta: all parameters.
+        s: bounded stiffnesses.
+        history: all frames.
+        states: states to search from, and those of frames that are not predicted [m].
+        only: frames to predict; all if None.
+        by_tool: whether what is held moves as the tool reports; if not, as observed.
+        max_predictions: largest number of predictions of a frame with a history-dependent effect.
     """
     grasps = history.by(lambda one: one.grasp, range(len(history.frames)) if only is None else only)
-    found, seen = states.copy(), np.full(states.shape, np.nan)
+    predicted, seen = states.copy(), np.full(states.shape, np.nan)
     rounds = (
-        ROUNDS if any(one.history_dependent and np.any(theta[sheet.place(one.name)]) for one in sheet.library) else 1
+        max_predictions
+        if any(effect.history_dependent and np.any(theta[sheet.place(effect.name)]) for effect in sheet.library)
+        else 1
     )
-    at, stiffnesses, told = jnp.asarray(theta), jnp.asarray(s), jnp.asarray(by_tool)
+    at, stiffnesses, use_tool = jnp.asarray(theta), jnp.asarray(s), jnp.asarray(by_tool)
 
-    def one(grasp: int) -> None:
+    def predict_grasp(grasp: int) -> None:
         known = states.copy()
         for k in grasps[grasp]:
             frame = history.frames[k].frame
             for _ in range(rounds):
-                there = predict(sheet, at, stiffnesses, frame, history.moment(k, known), jnp.asarray(known[k]), told)
-                x = np.asarray(there.x)
-                stays = np.abs(x - known[k]).max() < STAYS
-                known[k], found[k], seen[k] = x, x, np.asarray(there.seen)
-                if stays:
+                context, start = history.context(k, known), jnp.asarray(known[k])
+                prediction = predict(sheet, at, stiffnesses, frame, context, start, use_tool)
+                x = np.asarray(prediction.x)
+                converged = np.abs(x - known[k]).max() < CONVERGED
+                known[k], predicted[k], seen[k] = x, x, np.asarray(prediction.seen)
+                if converged:
                     break
 
-    parallel_map(one, grasps)
-    return found, seen
+    parallel_map(predict_grasp, grasps)
+    return predicted, seen

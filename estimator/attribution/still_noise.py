@@ -1,11 +1,11 @@
-"""The noise of positions, and how far it is the same for neighbours, from frames in which all is still.
+"""Noise of observed positions, and its correlation between neighbours, from frames in which nothing moves.
 
-White noise on each point, and a smooth field of it over the sheet,
+It is white noise on each point, and a smooth field over the sheet,
 
     cov(n_i, n_j) = sd^2 [i = j] + smooth_sd^2 exp(-|a_i - a_j|^2 / 2 length^2)
 
-for each coordinate alike. From one frame to the next, so that what drifts or jumps does not count; and never from what
-a fit leaves over: that holds the effects that are looked for.
+the same for each coordinate. It is measured from differences of consecutive frames, so that drifts and jumps do not
+count; and never from the residual of a fit, which holds the effects that are searched for.
 """
 
 from dataclasses import dataclass
@@ -15,80 +15,88 @@ from jaxtyping import Float
 
 from ..perception.point_tracker import usual
 
-PAIRS = 20_000
-"""Pairs of points whose covariance is looked at."""
+N_PAIRS = 20_000
+"""Random pairs of points from which the covariance is measured."""
 LENGTHS = np.geomspace(0.02, 0.5, 40)
-"""Ranges that are tried, in extents of the sheet."""
-MOST_SMOOTH = 0.95
-"""Largest share of the variance that the smooth part may be."""
-MODES, STEP = 45, 15
-"""Most smooth fields that the smooth part is made of; filled up with zeros to a multiple, so that most recordings are
-compiled for alike."""
-KEPT, MATTERS = 0.97, 0.5
-"""Share of the smooth part's variance that they hold, and the least variance along one, in units of the white part's;
-the rest counts as white."""
-FEWEST = 5
-"""Still frames from which noise is measured."""
-USUALLY = 0.9
-"""Share of the frames in which a point must be seen."""
-JUMP, RARELY = 4.0, 0.1
-"""Times the usual square of a difference, beyond which something else has happened between two frames, and the largest
-share of them for which that holds: what happens more often is noise."""
+"""Ranges that are tried [extents of the sheet]."""
+MAX_SMOOTH_SHARE = 0.95
+"""Largest share of the variance that the smooth part may have."""
+MAX_MODES = 45
+"""Largest number of fields that represent the smooth part."""
+MODE_MULTIPLE = 15
+"""Fields are padded with zeros to a multiple of this number, so that one compilation serves most recordings."""
+KEPT_VARIANCE = 0.97
+"""Share of the smooth part's variance that the fields hold; the rest counts as white."""
+MIN_MODE_VARIANCE = 0.5
+"""Smallest variance of a field [variances of the white part]; the others count as white."""
+MIN_FRAMES = 5
+"""Smallest number of still frames from which noise is measured."""
+MIN_OBSERVED = 0.9
+"""Smallest share of the frames in which a point is observed, for it to be used."""
+JUMP = 4.0
+"""Mean squared difference of two frames, over the usual one, beyond which something else happened between them."""
+MAX_JUMPS = 0.1
+"""Largest share of such differences; what happens more often is noise."""
+MIN_POINTS = 3
+"""Smallest number of points from which noise is measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StillNoise:
-    """Of one coordinate of one point."""
+    """Noise of one coordinate of one point."""
 
     sd: float
-    """White part [m]."""
+    """Standard deviation of the white part [m]."""
     smooth_sd: float
-    """Smooth part [m]."""
+    """Standard deviation of the smooth part [m]."""
     length: float
-    """Its range [m]."""
+    """Range of the smooth part [m]."""
     frames: int
-    """From how many frames; 0 if it was assumed."""
+    """Number of still frames; 0 if the noise is assumed."""
 
     def fields(self, rest: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n modes"], float]:
-        """The smooth part as fields of unit amplitude [m], and the white part's sd with what they leave [m]."""
+        """Return the smooth part as fields of unit amplitude [m], and the sd of the rest, white part included [m]."""
         squared = np.sum((rest[:, None] - rest[None]) ** 2, axis=2)
         values, vectors = np.linalg.eigh(np.exp(-0.5 * squared / self.length**2))
         values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
-        enough = int(np.searchsorted(np.cumsum(values), KEPT * values.sum())) + 1
-        matter = int(np.sum(values * self.smooth_sd**2 > MATTERS * self.sd**2))
-        m = min(enough, matter, MODES)
-        left = 1 - values[:m].sum() / values.sum()
-        fields = np.zeros((len(rest), -(-m // STEP) * STEP))
+        enough = int(np.searchsorted(np.cumsum(values), KEPT_VARIANCE * values.sum())) + 1
+        matter = int(np.sum(values * self.smooth_sd**2 > MIN_MODE_VARIANCE * self.sd**2))
+        m = min(enough, matter, MAX_MODES)
+        rest_share = 1 - values[:m].sum() / values.sum()
+        fields = np.zeros((len(rest), -(-m // MODE_MULTIPLE) * MODE_MULTIPLE))
         fields[:, :m] = self.smooth_sd * vectors[:, :m] * np.sqrt(values[:m])
-        return fields, float(np.sqrt(self.sd**2 + left * self.smooth_sd**2))
+        return fields, float(np.sqrt(self.sd**2 + rest_share * self.smooth_sd**2))
 
 
 def measure(
     series: list[Float[np.ndarray, "frames n 3"]], rest: Float[np.ndarray, "n 3"], *, seed: int = 0
 ) -> StillNoise | None:
-    """From the same points in series of frames in which nothing moves; None if there are too few.
+    """Return the noise of points in series of frames without motion; None if there are too few.
 
-    NaN where one is not seen.
+    Args:
+        series: positions [m], the same points in all; NaN where one is not observed.
+        rest: rest shape [m].
+        seed: of the random pairs.
     """
-    off = np.concatenate([np.zeros((0, *rest.shape)), *(np.diff(one, axis=0) for one in series)]) / np.sqrt(2)
-    frames = len(off) + sum(len(one) > 1 for one in series)
-    if frames < FEWEST:
+    difference = np.concatenate([np.zeros((0, *rest.shape)), *(np.diff(one, axis=0) for one in series)]) / np.sqrt(2)
+    frames = len(difference) + sum(len(one) > 1 for one in series)
+    if frames < MIN_FRAMES:
         return None
-    seen = np.isfinite(off).mean(axis=(0, 2)) > USUALLY
-    off = off[np.isfinite(off[:, seen]).all(axis=(1, 2))][:, seen]
-    if not len(off) or seen.sum() < 3:
+    seen = np.isfinite(difference).mean(axis=(0, 2)) > MIN_OBSERVED
+    difference = difference[np.isfinite(difference[:, seen]).all(axis=(1, 2))][:, seen]
+    if not len(difference) or seen.sum() < MIN_POINTS:
         return None
-    off = off[usual(np.mean(off**2, axis=(1, 2)), times=JUMP, rarely=RARELY)]
-    total = float(np.mean(off**2))
-    i, j = np.random.default_rng(seed).integers(0, int(seen.sum()), (2, PAIRS))
+    difference = difference[usual(np.mean(difference**2, axis=(1, 2)), times=JUMP, rarely=MAX_JUMPS)]
+    total = float(np.mean(difference**2))
+    i, j = np.random.default_rng(seed).integers(0, int(seen.sum()), (2, N_PAIRS))
     i, j = i[i != j], j[i != j]
-    apart = np.sum((rest[seen][i] - rest[seen][j]) ** 2, axis=1)
-    together = np.mean(off[:, i] * off[:, j], axis=(0, 2))
+    squared_distance = np.sum((rest[seen][i] - rest[seen][j]) ** 2, axis=1)
+    covariance = np.mean(difference[:, i] * difference[:, j], axis=(0, 2))
     lengths = float(np.ptp(rest, axis=0).max()) * LENGTHS
     best = (np.inf, 0.0, float(lengths[0]))
     for length in lengths:
-        kernel = np.exp(-0.5 * apart / length**2)
-        amplitude = max(float(kernel @ together / (kernel @ kernel)), 0.0)
-        best = min(best, (float(np.sum((together - amplitude * kernel) ** 2)), amplitude, float(length)))
-    smooth = min(best[1], MOST_SMOOTH * total)
+        kernel = np.exp(-0.5 * squared_distance / length**2)
+        amplitude = max(float(kernel @ covariance / (kernel @ kernel)), 0.0)
+        best = min(best, (float(np.sum((covariance - amplitude * kernel) ** 2)), amplitude, float(length)))
+    smooth = min(best[1], MAX_SMOOTH_SHARE * total)
     return StillNoise(sd=np.sqrt(total - smooth), smooth_sd=np.sqrt(smooth), length=best[2], frames=frames)

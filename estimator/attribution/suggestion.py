@@ -1,9 +1,9 @@
-"""The next pull and hold that tells the surviving hypotheses apart, or the word that none does.
+"""Suggest the next pull and hold that distinguishes the remaining hypotheses.
 
-A pull from each of several places is foretold by every hypothesis. What one foretells is held against what another
-shows, under the weights of the first: half the misfit is the log Bayes factor that the pull is expected to give in
+Every hypothesis predicts a pull from each of several places. The prediction of one is compared with the observation
+that another predicts, under the weights of the first. Half the squared residual is the expected log Bayes factor in
 favour of the right one, with the attachments and sizes that each was fitted with [Box and Hill 1967,
-doi:10.1080/00401706.1967.10490441]. No pull goes further than the recording has gone.
+doi:10.1080/00401706.1967.10490441]. No pull goes further than the recording did.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..physics.mesh import far_apart
-from ..planning.information_policy import PLACES, SLANTED, UP
+from ..planning.information_config import SLANTED, UP, InformationPolicyConfig
 from .closed_frames import USUAL_GAP, ClosedFrame, FrameHistory, Timed
 from .closing import Closed
 from .dataset import Dataset
@@ -26,78 +26,88 @@ from .held_out import from_rest
 from .problem import Point, Problem
 from .sheet import look
 
-BEST = 3
-"""Places, best when lifted from, from which slanted pulls are tried."""
+N_SLANTED_PLACES = 3
+"""Number of places from which slanted pulls are tried, the best by their lifts."""
 HOLD = 5.0
-"""How long what was pulled is held still [s]."""
-ENOUGH = 10.0
-"""What a pull must be expected to say [nat]."""
+"""Time for which the tool rests after the pull [s]."""
+MIN_EXPECTED = 10.0
+"""Expected log Bayes factor with which a pull is worth making [nat]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Suggestion:
-    """A grasp, a pull and a hold."""
+    """A suggested grasp, pull and hold."""
 
     grasp: Float[np.ndarray, " 3"]
-    """Where the jaws close [m]."""
+    """Position where the jaws close [m]."""
     pull: Float[np.ndarray, " 3"]
-    """Where the tool goes from there [m]."""
+    """Displacement of the tool from there [m]."""
     hold: float
-    """How long it stays there [s]."""
+    """Time for which it stays there [s]."""
     expected: float
-    """Log Bayes factor for the right hypothesis against the wrong one that is told from it worst [nat]."""
+    """Expected log Bayes factor of the right hypothesis against the wrong one that is hardest to distinguish [nat]."""
     between: tuple[str, ...]
-    """The hypotheses' effects."""
+    """Names of the hypotheses' effects."""
 
     @property
     def enough(self) -> bool:
-        """Whether it is worth the pull."""
-        return self.expected > ENOUGH
+        """Return whether the pull is worth making."""
+        return self.expected > MIN_EXPECTED
 
 
 def suggest(closed: Closed, dataset: Dataset, *, log: Callable[[str], None] = lambda _: None) -> Suggestion | None:
-    """Of the pulls that are tried, the one that is expected to tell most; None if there is nothing to tell apart."""
+    """Return the tried pull with the largest expected log Bayes factor; None if no effects are indistinguishable.
+
+    Args:
+        closed: result of closing the loop.
+        dataset: what it was closed over.
+        log: receives progress messages.
+    """
     open_ = [[best, *rivals] for best, rivals in zip(closed.accepted, closed.rivals, strict=True) if rivals]
     if not open_:
         return None
     hypotheses = open_[-1]
     fits, names = [one.fitted for one in hypotheses], tuple(one.effect.name for one in hypotheses)
-    log(f"looking for a pull that tells {', '.join(names)} apart")
-    rest, far, gap, radius = dataset.estimator.sheet.rest, *_usual(dataset)
-    places = far_apart(rest, PLACES).tolist()
+    log(f"searching for a pull that distinguishes {', '.join(names)}")
+    rest, length, gap, radius = dataset.estimator.sheet.rest, *_typical_grasp(dataset)
+    places = far_apart(rest, InformationPolicyConfig().n_places).tolist()
 
-    def tried(place: int, direction: Float[np.ndarray, " 3"]) -> tuple[float, int, Float[np.ndarray, " 3"]]:
-        frames = _frames(dataset, place, far * direction, gap=gap, radius=radius)
-        return told_apart(closed.problem, fits, frames), place, far * direction
+    def evaluate(place: int, direction: Float[np.ndarray, " 3"]) -> tuple[float, int, Float[np.ndarray, " 3"]]:
+        frames = _frames(dataset, place, length * direction, gap=gap, radius=radius)
+        return expected_log_bayes_factor(closed.problem, fits, frames), place, length * direction
 
-    best = sorted((tried(place, UP[0]) for place in places), key=lambda one: -one[0])
-    best += [tried(place, direction) for _, place, _ in best[:BEST] for direction in SLANTED]
+    best = sorted((evaluate(place, UP[0]) for place in places), key=lambda one: -one[0])
+    best += [evaluate(place, direction) for _, place, _ in best[:N_SLANTED_PLACES] for direction in SLANTED]
     expected, place, pull = max(best, key=lambda one: one[0])
     return Suggestion(grasp=rest[place], pull=pull, hold=HOLD, expected=expected, between=names)
 
 
-def told_apart(problem: Problem, fits: list[Fitted], frames: list[Timed]) -> float:
-    """What frames are expected to say for the right fit against the wrong one that comes closest to it [nat]."""
-    shown = [_shown(problem, one, frames) for one in fits]
-    return min(_against(problem, fits[k], shown[right]) for k, right in permutations(range(len(fits)), 2))
+def expected_log_bayes_factor(problem: Problem, fits: list[Fitted], frames: list[Timed]) -> float:
+    """Return the log Bayes factor expected from frames for the right fit against the closest wrong one [nat]."""
+    observed = [_simulated(problem, one, frames) for one in fits]
+    return min(_cost(problem, fits[k], observed[right]) for k, right in permutations(range(len(fits)), 2))
 
 
-def _shown(problem: Problem, fitted: Fitted, frames: list[Timed]) -> list[Timed]:
-    """The frames as they would be seen if a fit were right."""
-    lying = _lying(_of(problem, frames), fitted)
-    frames = [replace(one, frame=eqx.tree_at(lambda f: (f.y, f.rotated), one.frame, (lying, lying))) for one in frames]
-    told = [replace(one, frame=eqx.tree_at(lambda f: f.by_points, one.frame, jnp.asarray(False))) for one in frames]
-    seen = _predicted(_of(problem, told), fitted, by_tool=True).seen
+def _simulated(problem: Problem, fitted: Fitted, frames: list[Timed]) -> list[Timed]:
+    """Return the frames as they would be observed if a fit were right."""
+    at_rest = _observed_at_rest(_with_frames(problem, frames), fitted)
+    frames = [
+        replace(one, frame=eqx.tree_at(lambda f: (f.y, f.rotated), one.frame, (at_rest, at_rest))) for one in frames
+    ]
+    with_reports = [
+        replace(one, frame=eqx.tree_at(lambda f: f.by_points, one.frame, jnp.asarray(False))) for one in frames
+    ]
+    seen = _predicted(_with_frames(problem, with_reports), fitted, by_tool=True).seen
     return [
         replace(one, frame=eqx.tree_at(lambda f: f.y, one.frame, jnp.asarray(y)))
         for one, y in zip(frames, seen, strict=True)
     ]
 
 
-def _lying(problem: Problem, fitted: Fitted) -> Float[Array, "n 3"]:
-    """Where a fit has the sheet seen as the jaws close."""
-    moment = problem.history.moment(0, _at_rest(problem))
-    model = problem.sheet.model(jnp.asarray(fitted.point.theta), moment, jnp.zeros(3))
+def _observed_at_rest(problem: Problem, fitted: Fitted) -> Float[Array, "n 3"]:
+    """Return where a fit predicts that the sheet is observed as the jaws close [m]."""
+    context = problem.history.context(0, _at_rest(problem))
+    model = problem.sheet.model(jnp.asarray(fitted.point.theta), context, jnp.zeros(3))
     return look(model, problem.history.rest)
 
 
@@ -110,19 +120,19 @@ def _at_rest(problem: Problem) -> Float[np.ndarray, "frames n 3"]:
     return np.tile(np.asarray(problem.history.rest), (len(problem.history.frames), 1, 1))
 
 
-def _against(problem: Problem, fitted: Fitted, frames: list[Timed]) -> float:
-    """By how much frames speak against a fit [nat]."""
-    there = _of(problem, frames)
-    point = _predicted(there, fitted, by_tool=False)
-    return 0.5 * cost_under(there, weighed(there, point, list(range(len(frames)))), point)
+def _cost(problem: Problem, fitted: Fitted, frames: list[Timed]) -> float:
+    """Return the negative log likelihood of frames under a fit, without constants [nat]."""
+    problem = _with_frames(problem, frames)
+    point = _predicted(problem, fitted, by_tool=False)
+    return 0.5 * cost_under(problem, weighed(problem, point, list(range(len(frames)))), point)
 
 
-def _of(problem: Problem, frames: list[Timed]) -> Problem:
+def _with_frames(problem: Problem, frames: list[Timed]) -> Problem:
     return replace(problem, history=FrameHistory(frames, np.asarray(problem.history.rest)))
 
 
 def _frames(dataset: Dataset, place: int, pull: Float[np.ndarray, " 3"], *, gap: float, radius: float) -> list[Timed]:
-    """The jaws closed on a place, half of the pull, all of it, and after the hold; what is seen is left open."""
+    """Return frames of a pull: jaws closed, half of it, all of it, and after the hold; observations are not set yet."""
     rest = dataset.estimator.sheet.rest
     last, like = dataset.frames[-1], dataset.frames[-1].frame
     held = np.linalg.norm(rest - rest[place], axis=1) <= radius
@@ -138,7 +148,7 @@ def _frames(dataset: Dataset, place: int, pull: Float[np.ndarray, " 3"], *, gap:
                 held=jnp.asarray(held),
                 force_unknown=jnp.asarray(dataset.estimator.force_unknown(held)),
                 rotated=jnp.asarray(rest),
-                way=jnp.asarray(share * pull),
+                displacement=jnp.asarray(share * pull),
                 by_points=like.by_points,
                 held_sd=like.held_sd,
             ),
@@ -154,13 +164,13 @@ def _frames(dataset: Dataset, place: int, pull: Float[np.ndarray, " 3"], *, gap:
     ]
 
 
-def _usual(dataset: Dataset) -> tuple[float, float, float]:
-    """How far the tool goes at most [m], what lies between frames of a grasp [s], and how wide the jaws hold [m]."""
+def _typical_grasp(dataset: Dataset) -> tuple[float, float, float]:
+    """Return the tool's largest displacement [m], the median time between frames [s] and the grip's radius [m]."""
     rest, frames = dataset.estimator.sheet.rest, dataset.frames
     gaps = [b.time - a.time for a, b in pairwise(frames) if a.grasp == b.grasp]
     grips = [rest[np.asarray(one.frame.held)] for one in frames]
     return (
-        max(float(np.linalg.norm(one.frame.way)) for one in frames),
+        max(float(np.linalg.norm(one.frame.displacement)) for one in frames),
         float(np.median(gaps or [USUAL_GAP])),
         max(float(np.linalg.norm(grip - grip.mean(axis=0), axis=1).max()) for grip in grips),
     )

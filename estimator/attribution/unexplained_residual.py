@@ -1,8 +1,8 @@
-"""What a fit leaves that its own errors do not account for: how much larger they would have to be.
+"""Unexplained residual of a fit: how much larger the assumed errors would have to be to account for it.
 
-The likelihood of larger force errors, of smooth force fields of larger amplitude and of a tool that reports its way
-less well, against that of the usual ones. It stands for all causes that have no name here: an effect must do better
-than that.
+It is the likelihood of larger force errors, of smooth force fields of larger amplitude and of less precise tool
+reports, against that of the assumed ones. It stands for all causes that the library has no name for: an effect must
+explain more.
 """
 
 from dataclasses import dataclass
@@ -17,36 +17,40 @@ from .normal_equations import less_offset
 from .problem import Problem
 
 RATIO = 4.0
-VARIANCES = (1.0, RATIO, RATIO**2, RATIO**3)
-"""Of the forces, in units of the usual; from where one is less likely than the one before on, none is tried."""
+"""Ratio of neighbouring variances that are tried."""
+FORCE_VARIANCES = (1.0, RATIO, RATIO**2, RATIO**3)
+"""Variances of the forces that are tried [assumed variances]. Once one is less likely than the one before, the larger
+ones are not tried."""
 AMPLITUDES = (0.25, 1.0, 4.0, 16.0)
-"""Of the smooth fields, in units of the usual."""
+"""Amplitudes of the smooth fields that are tried [assumed amplitudes]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class UnexplainedResidual:
-    """The likeliest of those errors."""
+    """Likeliest size of the errors."""
 
     gain: float
-    """By how much the frames are likelier with them than with the usual ones, or smaller ones [nat]."""
+    """Log likelihood ratio of these errors to the assumed or smaller ones [nat]."""
     variance: float
-    """Of the forces, in units of the usual."""
+    """Variance of the forces [assumed variances]."""
     amplitude: float
-    """Of the smooth fields."""
+    """Amplitude of the smooth fields [assumed amplitudes]."""
     tool_variance: float
-    """Of what the tool says of the held particles."""
+    """Variance of the tool's residual [assumed variances]."""
 
 
-def unexplained_residual(problem: Problem, fitted: Fitted) -> UnexplainedResidual:
-    """Of a fit."""
+def unexplained_residual(
+    problem: Problem, fitted: Fitted, *, variances: tuple[float, ...] = FORCE_VARIANCES
+) -> UnexplainedResidual:
+    """Return the unexplained residual of a fit; `variances` are those of the forces that are tried, 1 first."""
     likelihoods: dict[tuple[float, float], float] = {}
-    for variance in VARIANCES:
+    for variance in variances:
         if likelihoods and max(likelihoods, key=lambda key: likelihoods[key])[0] < variance / RATIO:
             break
-        wider = problem.widened(variance, problem.amplitude)
-        weights = fitted.weights if variance == 1.0 else weighed(wider, fitted.around, list(fitted.weights))
-        every = residual(wider, weights, fitted.point)
-        whole = sum(float(_log_determinant(one)) for one in weights.values())
+        inflated = problem.inflated(variance, problem.amplitude)
+        weights = fitted.weights if variance == 1.0 else weighed(inflated, fitted.around, list(fitted.weights))
+        residuals = residual(inflated, weights, fitted.point)
+        log_determinants = sum(float(_log_determinant(one)) for one in weights.values())
         fields = [
             np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
             for frames in problem.by_part(weights).values()
@@ -54,16 +58,17 @@ def unexplained_residual(problem: Problem, fitted: Fitted) -> UnexplainedResidua
         for ratio in AMPLITUDES:
             amplitude = ratio * problem.amplitude
             common = sum(np.linalg.slogdet(np.eye(N_FIELDS) + amplitude**2 * one)[1] for one in fields)
-            likelihoods[variance, ratio] = -(cost(problem, weights, every, amplitude) + whole + common) / 2
+            minus_twice = cost(problem, weights, residuals, amplitude) + log_determinants + common
+            likelihoods[variance, ratio] = -minus_twice / 2
     best = max(likelihoods, key=lambda key: likelihoods[key])
     no_larger = max(likelihoods[1.0, ratio] for ratio in AMPLITUDES if ratio <= 1.0)
     gain = likelihoods[best] - no_larger
-    tool, gain_of_tool = _of_tool(problem, fitted)
-    return UnexplainedResidual(gain=float(gain + gain_of_tool), variance=best[0], amplitude=best[1], tool_variance=tool)
+    tool, tool_gain = tool_variance(problem, fitted)
+    return UnexplainedResidual(gain=float(gain + tool_gain), variance=best[0], amplitude=best[1], tool_variance=tool)
 
 
-def _of_tool(problem: Problem, fitted: Fitted) -> tuple[float, float]:
-    """The likeliest variance of what the tool says of the held particles, in units of the usual, and its gain [nat]."""
+def tool_variance(problem: Problem, fitted: Fitted) -> tuple[float, float]:
+    """Return the likeliest variance of the tool's residual [assumed variances], at least 1, and its gain [nat]."""
     squared = 0.0
     for frames in problem.by_part(fitted.equations).values():
         rows = np.array([np.asarray(fitted.equations[k].tool)[:, -1:] for k in frames])
@@ -75,4 +80,5 @@ def _of_tool(problem: Problem, fitted: Fitted) -> tuple[float, float]:
 
 @eqx.filter_jit
 def _log_determinant(metric: Metric):
+    """Return the log determinant as a compiled program."""
     return metric.log_determinant()

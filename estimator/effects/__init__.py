@@ -1,12 +1,13 @@
-"""What a sheet's model may lack: the library of effects."""
+"""Effects that the declared model of a sheet may lack; `effect.py` says how to add one."""
 
 from .effect import Effect
-from .history_dependent import MEMORY
+from .history_dependent import HISTORY_DEPENDENT
 from .mechanical import MECHANICAL
 from .sensing import SENSING
 from .swing import SWING
 
-LIBRARY: tuple[Effect, ...] = (*MECHANICAL, *MEMORY, *SENSING, *SWING)
-"""All that are looked for, unless something else is asked. What swings is the sheet as late as it is seen: the last."""
+LIBRARY: tuple[Effect, ...] = (*MECHANICAL, *HISTORY_DEPENDENT, *SENSING, *SWING)
+"""All effects that are tested by default. They act on the model in this order; `swing` is last, because it acts at the
+time that the latencies before it have set."""
 
 __all__ = ["LIBRARY", "Effect"]

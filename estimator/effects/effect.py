@@ -1,4 +1,24 @@
-"""What an effect is: a small addition to the sheet's model, with a few parameters that are 0 where it is absent."""
+"""Definition of an effect: a small addition to the sheet's model, with parameters that are 0 where it is absent.
+
+To add an effect to the library:
+
+1. Choose the file: `mechanical.py` if it depends on the current shape alone, `history_dependent.py` if it depends on
+   earlier shapes, `sensing.py` if it is of the tool, the camera or the tracker.
+2. Write a function `acts(model, theta, context)` that returns a changed `SheetModel`. `theta` are the parameters, and
+   `context` holds what may be known of the frame. Change an existing term of the energy with `model.term(Kind)`,
+   `equinox.tree_at` and `model.with_term`; or `model.tool` (the tool's displacement), `model.view` (how positions are
+   observed), `model.energy.rest` (the anchors). Keep all shapes and types. It must be differentiable, and change
+   nothing at theta = 0.
+3. Only if no term of the energy can express it, add one to `terms.py`, with zero energy by default, and to
+   `sheet_model.nominal_energy`.
+4. Add an `Effect` with this function to the tuple at the end of the file. Say where the scale of `prior_sd` comes from.
+   List in `confounded_with` the effects that look similar, and add the new one to their lists.
+5. Add its row to docs/EFFECTS.md. tests/estimator/effects/test_effects.py then checks the value at 0 and the
+   derivatives of every effect in the library. Add a test against a closed form there.
+
+A user can add an effect without touching the library: pass `(*LIBRARY, mine)` to `close_loop`. It is checked by
+`attribution.user_effects.check_effects` before any fit.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +28,8 @@ from jaxtyping import Array, Float
 from .sheet_model import FrameContext, SheetModel
 
 Acts = Callable[[SheetModel, Float[Array, " p"], FrameContext], SheetModel]
-"""The model of one frame with the effect in it, for parameters and what may be known of the frame; differentiable."""
+"""Function that returns one frame's model with the effect in it, from the model without, the parameters and the frame's
+context; differentiable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,35 +37,38 @@ class Effect:
     """One addition to the model.
 
     Raises:
-        ValueError: a name, unit or prior that is none.
+        ValueError: the name, the units, the prior or an initial guess is not valid.
     """
 
     name: str
+    """Name in reports: letters, digits and underscores."""
     acts: Acts
+    """Function that adds the effect to a frame's model."""
     units: tuple[str, ...]
-    """Of each parameter, "" for a pure number."""
+    """Unit of each parameter, "" for a pure number."""
     prior_sd: tuple[float, ...]
-    """Standard deviation of each parameter before anything is seen, in its unit."""
+    """Prior standard deviation of each parameter, in its unit; the prior mean is 0."""
     sites: int = 1
-    """At how many places, or in how many directions, it may be, at one of them alone; `acts` takes the parameters of
-    all of them, one site after the other."""
+    """Number of places or directions that the effect may have; it has one of them. `acts` takes the parameters of all
+    sites, one site after the other."""
     initial_guesses: tuple[tuple[float, ...], ...] = ()
-    """Parameters from which a fit may begin, for an effect that shows little of itself in its derivatives at 0."""
+    """Parameters from which a fit may start as well, for an effect whose derivatives at 0 show little of it."""
     source: str
-    """Where the prior's scale comes from."""
+    """Where the scale of the prior comes from."""
     confounded_with: tuple[str, ...] = ()
-    """Effects that often look like it, and attachments that do."""
+    """Effects that often look like it; "attachments" if those do."""
     non_negative: bool = False
-    """Whether parameters below 0 make no sense."""
+    """Whether negative parameters are excluded."""
     history_dependent: bool = False
-    """Whether it depends on where the sheet is in the frame itself (`FrameContext.past`): predicted until it stays."""
+    """Whether it depends on the frame's own state through `FrameContext.past`. Such a frame is predicted repeatedly
+    until its state converges."""
     hanging: bool = False
-    """Whether only a sheet with weight and no bed under it may have it."""
+    """Whether it applies only to a sheet with weight and no bed under it."""
     sensing: bool = False
-    """Whether it is of the tool, the camera or the tracker, so that it holds for one session alone."""
+    """Whether it is of the tool, the camera or the tracker; its size then holds for one session alone."""
 
     def __post_init__(self) -> None:
-        """Check what a user may have typed."""
+        """Check what a user may have given."""
         if not self.name.replace("_", "").isalnum():
             raise ValueError(f"Effect.name must be of letters, digits and underscores; got {self.name!r}.")
         if len(self.units) != len(self.prior_sd) or not self.prior_sd:
@@ -52,7 +76,7 @@ class Effect:
                 f"Effect {self.name}: units and prior_sd need one entry for each parameter; got {len(self.units)} and "
                 f"{len(self.prior_sd)}."
             )
-        if any(len(one) != len(self.prior_sd) for one in self.initial_guesses):
+        if any(len(guess) != len(self.prior_sd) for guess in self.initial_guesses):
             raise ValueError(
                 f"Effect {self.name}: each of initial_guesses needs {len(self.prior_sd)} parameters; got "
                 f"{self.initial_guesses}."
@@ -62,5 +86,5 @@ class Effect:
 
     @property
     def size(self) -> int:
-        """How many parameters there are at all sites."""
+        """Return the number of parameters, those of all sites together."""
         return self.sites * len(self.prior_sd)

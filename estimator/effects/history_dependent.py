@@ -1,4 +1,4 @@
-"""Effects that depend on where the sheet was: friction, drag, damping, creep, inertia."""
+"""Effects that depend on earlier states of the sheet: friction, drag, damping, creep, inertia."""
 
 import equinox as eqx
 import jax
@@ -13,74 +13,78 @@ from .sheet_model import FrameContext, SheetModel
 from .terms import DeadLoad, FrictionElements
 
 
-def _friction(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """Coulomb's, with what the bed carries of the frame as far as it is known."""
+def _friction(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Add Coulomb friction on the bed; the pressing force is that of the frame's state as known so far."""
     if not model.has(BedContact):  # a sheet in the air
         return model
-    bed, rub = model.term(BedContact), model.term(FrictionElements)
-    pressed = bed.gradient(moment.now[:, None])[:, 0] @ -bed.up
-    changed = (moment.before, theta[0] * pressed, bed.up)
-    return model.with_term(eqx.tree_at(lambda t: (t.start, t.resisted, t.up), rub, changed))
+    bed, friction = model.term(BedContact), model.term(FrictionElements)
+    pressed = bed.gradient(context.now[:, None])[:, 0] @ -bed.up
+    changed = (context.before, theta[0] * pressed, bed.up)
+    return model.with_term(eqx.tree_at(lambda t: (t.start, t.resisted, t.up), friction, changed))
 
 
-def _viscous_drag(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """A force against each particle's own velocity: theta k v."""
+def _viscous_drag(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Add a force against each particle's own velocity, theta k v."""
     k = model.term(TriangleMembrane).stiffness
-    return _tethered(model, moment.before, jnp.full(len(moment.rest), theta[0] * k / moment.gap))
+    return _tethered(model, context.before, jnp.full(len(context.rest), theta[0] * k / context.gap))
 
 
-def _inertia(model: SheetModel, theta: Float[Array, " 2"], moment: FrameContext) -> SheetModel:
-    """Each particle's mass goes on as it went, the slower the more it is damped: a step of implicit Euler.
+def _inertia(model: SheetModel, theta: Float[Array, " 2"], context: FrameContext) -> SheetModel:
+    """Add inertia by a step of implicit Euler: each mass continues with its damped velocity.
 
-    theta: the share of the mass that the frames show, and how much of the speed is lost in a second.
+    theta: the share of the mass that acts, and the rate at which the velocity decays [1/s].
     """
     mass = model.term(Weight).mass
-    speed = (moment.before - moment.earlier) / moment.earlier_gap
-    kept = jnp.exp(-theta[1] * moment.gap)
-    there = moment.before + moment.gap * kept * speed
-    return _tethered(model, there, theta[0] * mass / moment.gap**2)
+    velocity = (context.before - context.earlier) / context.earlier_gap
+    decay = jnp.exp(-theta[1] * context.gap)
+    free_motion = context.before + context.gap * decay * velocity
+    return _tethered(model, free_motion, theta[0] * mass / context.gap**2)
 
 
-def _material_damping(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """Kelvin and Voigt's: stress C (E + theta dE/dt), of stretching and of bending, after what changes either.
+def _material_damping(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Add Kelvin-Voigt damping, stress C (E + theta dE/dt), of stretching and of bending.
 
-    As if all had settled in the frame before; a hinge that is stretched within its plane is stiffer, without memory.
+    It takes all to have settled in the frame before. A hinge that is stretched within its plane becomes stiffer,
+    without memory.
     """
-    left = moment.left_behind(theta[0])
-    more = left / (1 - left)
+    lag = context.lag_share(theta[0])
+    more = lag / (1 - lag)
     membrane, bending = model.term(TriangleMembrane), model.term(IsometricBending)
-    strain = membrane.strain(moment.before[membrane.vertices])
+    strain = membrane.strain(context.before[membrane.vertices])
     stiffer = (1 + more) * membrane.elasticity, (membrane.inelastic + more * strain) / (1 + more)
     stretched = model.with_term(eqx.tree_at(lambda t: (t.elasticity, t.inelastic), membrane, stiffer))
-    bent = (bending.curvature + more * bending.bent(moment.before[bending.vertices])) / (1 + more)
-    weighed = jnp.sqrt(1 + more) * bending.weight, jnp.sqrt(1 + more) * bent
-    return stretched.with_term(eqx.tree_at(lambda t: (t.weight, t.curvature), bending, weighed))
+    bent = (bending.curvature + more * bending.bent(context.before[bending.vertices])) / (1 + more)
+    weighted = jnp.sqrt(1 + more) * bending.weight, jnp.sqrt(1 + more) * bent
+    return stretched.with_term(eqx.tree_at(lambda t: (t.weight, t.curvature), bending, weighted))
 
 
-def _tissue_creep(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """The unstressed strain follows the strain at a rate."""
+def _tissue_creep(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Let the unstressed strain follow the strain at the rate theta [1/s]."""
     membrane = model.term(TriangleMembrane)
-    strains = jax.vmap(lambda x: membrane.strain(x[membrane.vertices]))(moment.past)
-    crept = jnp.einsum("t,tfp->fp", moment.faded(theta[0]), strains)
+    strains = jax.vmap(lambda x: membrane.strain(x[membrane.vertices]))(context.past)
+    crept = jnp.einsum("t,tfp->fp", context.memory_weights(theta[0]), strains)
     return model.with_term(eqx.tree_at(lambda t: t.inelastic, membrane, membrane.inelastic + crept))
 
 
-def _anchor_creep(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """Anchors follow what they hold at a rate."""
-    crept = jnp.einsum("t,tni->ni", moment.faded(theta[0]), moment.past - moment.rest[None])
-    return eqx.tree_at(lambda one: one.energy.rest, model, model.energy.rest + crept)
+def _anchor_creep(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Let the anchors follow what they hold at the rate theta [1/s]."""
+    crept = jnp.einsum("t,tni->ni", context.memory_weights(theta[0]), context.past - context.rest[None])
+    return eqx.tree_at(lambda m: m.energy.rest, model, model.energy.rest + crept)
 
 
 def _tethered(model: SheetModel, to: Float[Array, "n 3"], stiffness: Float[Array, " n"]) -> SheetModel:
-    """With one more spring on each particle: towards where the tether is, and a load that takes it on to `to`."""
+    """Add a spring of some stiffness from each particle to its place in `to`.
+
+    It is a spring to where the tether is already, and a dead load that makes up for the difference.
+    """
     tether, load = model.term(Tether), model.term(DeadLoad)
     stiffer = tether.stiffness + stiffness[:, None, None] * jnp.eye(3, dtype=to.dtype)[None]
-    pulled = load.force + stiffness[:, None] * (to - tether.to)
+    force = load.force + stiffness[:, None] * (to - tether.to)
     sprung = model.with_term(eqx.tree_at(lambda t: t.stiffness, tether, stiffer))
-    return sprung.with_term(eqx.tree_at(lambda t: t.force, load, pulled))
+    return sprung.with_term(eqx.tree_at(lambda t: t.force, load, force))
 
 
-MEMORY = (
+HISTORY_DEPENDENT = (
     Effect(
         name="friction",
         acts=_friction,

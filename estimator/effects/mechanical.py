@@ -1,4 +1,4 @@
-"""Effects of the tissue and of what it lies on that depend on where the sheet is, not on where it was."""
+"""Effects of the tissue and of what it lies on that depend on the current state of the sheet alone."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,39 +10,44 @@ from ..physics.environment import BedContact, Weight
 from ..physics.hanging import Tension
 from ..physics.membrane import TriangleMembrane, plane_stress
 from .effect import Effect
-from .sheet_model import FrameContext, SheetModel, across, extent
+from .sheet_model import FrameContext, SheetModel, extent, material_coordinates
 from .terms import AdhesionFilm, DeadLoad
 
 STANDARD_GRAVITY = 9.80665
-"""[m/s^2]."""
+"""Standard acceleration of gravity [m/s^2]; CODATA's g_n."""
 MODES = 4
-"""Cosines along each side of the sheet that its stiffness may vary by."""
+"""Cosines along each side of the sheet by which its stiffness may vary."""
 GRID = 6
-"""Places along each side where a spot is looked for."""
+"""Places along each side of the sheet where a spot may be."""
+SPOT_WIDTH = 0.75
+"""Standard deviation of a spot, in distances of neighbouring ones: wide enough that the spots overlap a little."""
 ANGLES = 12
-"""Directions in which fibres are looked for."""
+"""Directions of fibres, evenly over half a turn."""
+LOWEST_MODE_SD = 0.6
+"""Prior standard deviation of the lowest modes of the stiffness [log factor]: about half a factor of e."""
 
 
 def flat(membrane: TriangleMembrane, rest: Float[Array, "n 3"], x: Float[Array, "m 3"]) -> Float[Array, "m 2"]:
-    """Places in the sheet along its two material axes, from 0 to 1 over its extent."""
-    low, high = extent(across(membrane, rest, rest))
-    return (across(membrane, rest, x) - low) / (high - low)
+    """Return the coordinates of positions x [m] along the sheet's two material axes, from 0 to 1 over its extent."""
+    low, high = extent(material_coordinates(membrane, rest, rest))
+    return (material_coordinates(membrane, rest, x) - low) / (high - low)
 
 
 def spots(place: Float[Array, "m 2"]) -> Float[Array, "m spots"]:
-    """How much of each of a grid of round spots, which overlap a little, is at each place."""
+    """Return the value of each spot of a grid of round, slightly overlapping spots, at places from 0 to 1."""
     middle = jnp.asarray((np.arange(GRID) + 0.5) / GRID)
-    near = jnp.exp(-0.5 * ((place[:, :, None] - middle[None, None]) * GRID / 0.75) ** 2)
+    near = jnp.exp(-0.5 * ((place[:, :, None] - middle[None, None]) * GRID / SPOT_WIDTH) ** 2)
     return (near[:, 0, :, None] * near[:, 1, None, :]).reshape(len(place), GRID**2)
 
 
 def cosines(place: Float[Array, "m 2"], waves: int) -> Float[Array, "m modes"]:
-    """Products of cosines along the two axes, that many along each, the constant first."""
+    """Return the products of cosines along the two axes, `waves` along each, the constant first."""
     wave = jnp.cos(np.pi * jnp.arange(float(waves))[None, :, None] * place[:, None, :])
     return (wave[:, :, None, 0] * wave[:, None, :, 1]).reshape(len(place), waves**2)
 
 
-def _gravity(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
+def _gravity(model: SheetModel, theta: Float[Array, " 3"], context: FrameContext) -> SheetModel:
+    """Add theta [g] to gravity; the pre-stress of a hanging sheet grows with the gravity along its own."""
     weight = model.term(Weight)
     gravity = weight.gravity + STANDARD_GRAVITY * theta
     changed = model.with_term(eqx.tree_at(lambda t: t.gravity, weight, gravity))
@@ -52,95 +57,104 @@ def _gravity(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext)
     return changed.with_term(eqx.tree_at(lambda t: t.stress, tension, share * tension.stress))
 
 
-def _bed(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
+def _bed(model: SheetModel, theta: Float[Array, " 3"], context: FrameContext) -> SheetModel:
+    """Raise the bed by theta[0] [m], and tilt it along x and y by theta[1:] [rad]."""
     if not model.has(BedContact):  # a sheet in the air
         return model
-    bed, level = model.term(BedContact), moment.rest - jnp.mean(moment.rest, axis=0)[None]
+    bed, level = model.term(BedContact), context.rest - jnp.mean(context.rest, axis=0)[None]
     raised = theta[0] + level[:, 0] * theta[1] + level[:, 1] * theta[2]
     return model.with_term(eqx.tree_at(lambda t: t.height, bed, bed.height + raised))
 
 
-def _stretch(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
+def _stretch(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Multiply the membrane's stiffness by exp(theta)."""
     return _stiffer(model, jnp.exp(theta[0]))
 
 
-def _poisson(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """By how much the sheet narrows as it is stretched; Young's modulus stays."""
+def _poisson(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Add theta to Poisson's ratio at the same Young's modulus."""
     membrane = model.term(TriangleMembrane)
     change = membrane.stiffness * (plane_stress(membrane.poisson + theta[0]) - plane_stress(membrane.poisson))
     return _with_elasticity(model, membrane.elasticity + change[None])
 
 
-def _bending(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
+def _bending(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Multiply the bending stiffness by exp(theta)."""
     bending, root = model.term(IsometricBending), jnp.exp(theta[0] / 2)
     changed = eqx.tree_at(lambda t: (t.weight, t.curvature), bending, (root * bending.weight, root * bending.curvature))
     return model.with_term(changed)
 
 
-def _heterogeneity(model: SheetModel, theta: Float[Array, " modes"], moment: FrameContext) -> SheetModel:
-    return _stiffer(model, jnp.exp(cosines(_places(model, moment), MODES) @ theta)[:, None, None])
+def _heterogeneity(model: SheetModel, theta: Float[Array, " modes"], context: FrameContext) -> SheetModel:
+    """Multiply the membrane's stiffness by the exponential of a smooth field."""
+    return _stiffer(model, jnp.exp(cosines(_places(model, context), MODES) @ theta)[:, None, None])
 
 
-def _inclusion(model: SheetModel, theta: Float[Array, " spots"], moment: FrameContext) -> SheetModel:
-    return _stiffer(model, jnp.exp(spots(_places(model, moment)) @ theta)[:, None, None])
+def _inclusion(model: SheetModel, theta: Float[Array, " spots"], context: FrameContext) -> SheetModel:
+    """Multiply the membrane's stiffness by the exponential of round spots."""
+    return _stiffer(model, jnp.exp(spots(_places(model, context)) @ theta)[:, None, None])
 
 
-def _anisotropy(model: SheetModel, theta: Float[Array, " angles"], moment: FrameContext) -> SheetModel:
-    """Fibres along n of strength a store a k (n.E n)^2 / 2 an area."""
+def _anisotropy(model: SheetModel, theta: Float[Array, " angles"], context: FrameContext) -> SheetModel:
+    """Add fibres of strength a along n, whose energy per area is a k (n.E n)^2 / 2."""
     membrane, angle = model.term(TriangleMembrane), jnp.asarray(np.pi * np.arange(ANGLES) / ANGLES)
     along = jnp.stack([jnp.cos(angle) ** 2, jnp.sin(angle) ** 2, jnp.cos(angle) * jnp.sin(angle)], axis=1)
     fibres = membrane.stiffness * jnp.einsum("a,ap,aq->pq", theta, along, along)
     return _with_elasticity(model, membrane.elasticity + fibres[None])
 
 
-def _pre_strain(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
-    """Where it lay the sheet was longer by theta than it would be by itself."""
+def _pre_strain(model: SheetModel, theta: Float[Array, " 3"], context: FrameContext) -> SheetModel:
+    """Make the resting sheet longer by the strain theta than the stress-free one."""
     membrane = model.term(TriangleMembrane)
     longer = jnp.stack([theta[0], theta[1], 2 * theta[2]])
     return model.with_term(eqx.tree_at(lambda t: t.inelastic, membrane, membrane.inelastic - longer[None]))
 
 
-def _strain_stiffening(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
+def _strain_stiffening(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Add theta to the membrane's strain stiffening [1/strain^2]."""
     membrane = model.term(TriangleMembrane)
     return model.with_term(eqx.tree_at(lambda t: t.stiffening, membrane, membrane.stiffening + theta[0]))
 
 
-def _anchor_shift(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
-    return eqx.tree_at(lambda one: one.energy.rest, model, model.energy.rest + theta[None])
+def _anchor_shift(model: SheetModel, theta: Float[Array, " 3"], context: FrameContext) -> SheetModel:
+    """Shift all anchors by theta [m]."""
+    return eqx.tree_at(lambda m: m.energy.rest, model, model.energy.rest + theta[None])
 
 
-def _point_pull(model: SheetModel, theta: Float[Array, " pulls"], moment: FrameContext) -> SheetModel:
-    """One force a spot, spread over its particles."""
-    share = spots(flat(model.term(TriangleMembrane), moment.rest, moment.rest))
+def _point_pull(model: SheetModel, theta: Float[Array, " pulls"], context: FrameContext) -> SheetModel:
+    """Add a force [N] at each spot, spread over its particles."""
+    share = spots(flat(model.term(TriangleMembrane), context.rest, context.rest))
     share = share / jnp.maximum(jnp.sum(share, axis=0), 1.0)[None]
     load = model.term(DeadLoad)
     return model.with_term(eqx.tree_at(lambda t: t.force, load, load.force + share @ theta.reshape(GRID**2, 3)))
 
 
-def _adhesion(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
+def _adhesion(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Add an adhesion film of work theta [J/m^2]."""
     film, membrane = model.term(AdhesionFilm), model.term(TriangleMembrane)
-    area = jnp.zeros(len(moment.rest)).at[membrane.vertices].add(membrane.area[:, None] / 3)
+    area = jnp.zeros(len(context.rest)).at[membrane.vertices].add(membrane.area[:, None] / 3)
     return model.with_term(eqx.tree_at(lambda t: t.work, film, film.work + theta[0] * area))
 
 
-def _stiffer(model: SheetModel, times: Float[Array, "*f"]) -> SheetModel:
-    return _with_elasticity(model, times * model.term(TriangleMembrane).elasticity)
+def _stiffer(model: SheetModel, factor: Float[Array, "*f"]) -> SheetModel:
+    """Return the model with the membrane's stiffness multiplied."""
+    return _with_elasticity(model, factor * model.term(TriangleMembrane).elasticity)
 
 
 def _with_elasticity(model: SheetModel, elasticity: Float[Array, "f 3 3"]) -> SheetModel:
     return model.with_term(eqx.tree_at(lambda t: t.elasticity, model.term(TriangleMembrane), elasticity))
 
 
-def _places(model: SheetModel, moment: FrameContext) -> Float[Array, "f 2"]:
-    """Of the triangles' middles."""
+def _places(model: SheetModel, context: FrameContext) -> Float[Array, "f 2"]:
+    """Return the coordinates of the triangles' centroids, from 0 to 1 over the sheet's extent."""
     membrane = model.term(TriangleMembrane)
-    return flat(membrane, moment.rest, jnp.mean(moment.rest[membrane.vertices], axis=1))
+    return flat(membrane, context.rest, jnp.mean(context.rest[membrane.vertices], axis=1))
 
 
-def _falling() -> tuple[float, ...]:
-    """Smooth fields are likelier: half a factor of e in the lowest modes, less with the square of the wave number."""
-    wave = np.add.outer(np.arange(MODES) ** 2, np.arange(MODES) ** 2).ravel()
-    return tuple(float(one) for one in 0.6 / np.maximum(wave, 1))
+def _mode_sds() -> tuple[float, ...]:
+    """Return the prior standard deviations of the modes, which fall with the square of the wave number."""
+    squared_wave_number = np.add.outer(np.arange(MODES) ** 2, np.arange(MODES) ** 2).ravel()
+    return tuple(float(sd) for sd in LOWEST_MODE_SD / np.maximum(squared_wave_number, 1))
 
 
 MECHANICAL = (
@@ -188,7 +202,7 @@ MECHANICAL = (
         name="heterogeneity",
         acts=_heterogeneity,
         units=("log factor",) * MODES**2,
-        prior_sd=_falling(),
+        prior_sd=_mode_sds(),
         source="Young's modulus of skin differs between places by factors of 2 to 5",
         confounded_with=("inclusion", "anisotropy", "attachments"),
     ),

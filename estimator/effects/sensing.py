@@ -1,4 +1,4 @@
-"""Effects of the tool, the camera and the tracker: what is reported, and how the sheet is seen."""
+"""Effects of the tool, the camera and the tracker: what the tool reports, and how the sheet is observed."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,108 +6,109 @@ from jaxtyping import Array, Float
 
 from ..physics.membrane import TriangleMembrane
 from .effect import Effect
-from .sheet_model import FrameContext, SheetModel, across, extent
+from .sheet_model import FrameContext, SheetModel, extent, material_coordinates
 from .surface_points import SurfacePoints
 
 SMALL_ANGLE = 1e-3
-"""[rad]."""
+"""Angle below which a rotation is computed by its series [rad]: the terms that are left out are below rounding."""
 BEGAN_SD = 2.0
-"""Of when a drift began, from when the sheet lay as its rest shape has it [s]."""
+"""Prior standard deviation of the time at which a drift begins, from the time of the rest shape [s]."""
 EDGE = 1e-6
-"""How far what slides may go beyond the edge, so that at rest it may go either way [m]."""
+"""Distance by which a sliding point may go beyond the edge, so that at rest it has derivatives both ways [m]."""
 
 
-def _tool_bias(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
-    """What is held lies elsewhere than the tool's way since the jaws closed says: they slid, or the report jumped."""
-    return _taken(model, model.tool + jnp.where(moment.closed > 0, theta, 0.0))
+def _tool_bias(model: SheetModel, theta: Float[Array, " 3"], context: FrameContext) -> SheetModel:
+    """Shift what is held by theta [m] since the jaws closed: it slid, or the tool's report jumped."""
+    return _with_tool(model, model.tool + jnp.where(context.closed > 0, theta, 0.0))
 
 
-def _tool_scale(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """The true way is exp(theta) times the reported one."""
-    return _taken(model, jnp.exp(theta[0]) * model.tool)
+def _tool_scale(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Multiply the tool's reported displacement by exp(theta)."""
+    return _with_tool(model, jnp.exp(theta[0]) * model.tool)
 
 
-def _tool_latency(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """What is reported now is where the tool was theta ago."""
-    return _at_another_time(model, moment, theta[0])
+def _tool_latency(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Let the tool's reports arrive late by theta [s]."""
+    return _at_another_time(model, context, theta[0])
 
 
-def _image_latency(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """What is seen now is the sheet as the tool held it theta ago."""
-    return _at_another_time(model, moment, -theta[0])
+def _image_latency(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Let the images arrive late by theta [s]."""
+    return _at_another_time(model, context, -theta[0])
 
 
-def _tool_turn(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
-    """The true way is the reported one turned by theta [rad], late as either may be."""
-    return _taken(model, _rotation(theta) @ model.tool)
+def _tool_turn(model: SheetModel, theta: Float[Array, " 3"], context: FrameContext) -> SheetModel:
+    """Rotate the tool's reported displacement by theta [rad], after the latencies have changed it."""
+    return _with_tool(model, _rotation(theta) @ model.tool)
 
 
-def _camera_bias(model: SheetModel, theta: Float[Array, " 6"], moment: FrameContext) -> SheetModel:
-    """Shift [m] and turn [rad] of all that is seen, about the middle of the sheet, since it was seen at rest."""
-    return _moved(model, theta[:3], theta[3:])
+def _camera_bias(model: SheetModel, theta: Float[Array, " 6"], context: FrameContext) -> SheetModel:
+    """Shift [m] and rotate [rad] all that is observed since the sheet was observed at rest, about its middle."""
+    return _with_pose(model, theta[:3], theta[3:])
 
 
-def _camera_drift(model: SheetModel, theta: Float[Array, " 7"], moment: FrameContext) -> SheetModel:
-    """The same, growing with time from when it began."""
-    lasted = _since(theta[6], moment)
-    return _moved(model, lasted * theta[:3], lasted * theta[3:6])
+def _camera_drift(model: SheetModel, theta: Float[Array, " 7"], context: FrameContext) -> SheetModel:
+    """Shift and rotate like `camera_bias`, in proportion to the time since theta[6] [s]."""
+    duration = _duration(theta[6], context)
+    return _with_pose(model, duration * theta[:3], duration * theta[3:6])
 
 
-def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], moment: FrameContext) -> SheetModel:
-    """All is seen larger by a factor about the camera, and that is somewhere beside the middle of the sheet."""
+def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], context: FrameContext) -> SheetModel:
+    """Scale all that is observed by exp(theta[0]) about the camera, at theta[1:] [m] from the sheet's middle."""
     factor = jnp.exp(theta[0])
-    larger = eqx.tree_at(lambda one: one.view.turn, model, factor * model.view.turn)
-    return eqx.tree_at(lambda one: one.view.shift, larger, larger.view.shift + (1 - factor) * theta[1:])
+    scaled = eqx.tree_at(lambda m: m.view.rotation, model, factor * model.view.rotation)
+    return eqx.tree_at(lambda m: m.view.shift, scaled, scaled.view.shift + (1 - factor) * theta[1:])
 
 
-def _point_slip(model: SheetModel, theta: Float[Array, " 3"], moment: FrameContext) -> SheetModel:
-    """What is followed slides over the sheet since it began to, at most to the edge of the rectangle around it."""
+def _point_slip(model: SheetModel, theta: Float[Array, " 3"], context: FrameContext) -> SheetModel:
+    """Let tracked points slide over the sheet at theta[:2] [m/s] since theta[2] [s], at most to its bounding box."""
     membrane = model.term(TriangleMembrane)
-    place = across(membrane, moment.rest, moment.rest)
+    place = material_coordinates(membrane, context.rest, context.rest)
     low, high = extent(place)
-    to = jnp.clip(place + _since(theta[2], moment) * theta[None, :2], low - EDGE, high + EDGE)
-    return eqx.tree_at(
-        lambda one: one.view.followed, model, SurfacePoints.at(jnp.asarray(membrane.vertices), place, to)
-    )
+    to = jnp.clip(place + _duration(theta[2], context) * theta[None, :2], low - EDGE, high + EDGE)
+    points = SurfacePoints.at(jnp.asarray(membrane.vertices), place, to)
+    return eqx.tree_at(lambda m: m.view.points, model, points)
 
 
-def _surface_height(model: SheetModel, theta: Float[Array, " 1"], moment: FrameContext) -> SheetModel:
-    """The surface that is seen lies theta above the middle of the sheet."""
-    return eqx.tree_at(lambda one: one.view.height, model, model.view.height + theta[0])
+def _surface_height(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
+    """Put the observed surface theta [m] above the middle surface of the sheet."""
+    return eqx.tree_at(lambda m: m.view.height, model, model.view.height + theta[0])
 
 
-def _since(began: Float[Array, ""], moment: FrameContext) -> Float[Array, ""]:
-    """How long it has lasted [s]."""
-    return jnp.maximum(moment.time - began, 0.0)
+def _duration(began: Float[Array, ""], context: FrameContext) -> Float[Array, ""]:
+    """Return the time since an effect began [s], 0 before."""
+    return jnp.maximum(context.time - began, 0.0)
 
 
-def _at_another_time(model: SheetModel, moment: FrameContext, later: Float[Array, ""]) -> SheetModel:
-    """With the tool where its reports have it so much later; where the jaws close, what they hold has gone nowhere."""
+def _at_another_time(model: SheetModel, context: FrameContext, later: Float[Array, ""]) -> SheetModel:
+    """Return the model with the tool as reported `later` [s] than the frame; unmoved where the jaws close."""
 
     def at(time: Array) -> Array:
-        return jnp.stack([jnp.interp(time, moment.report_times, moment.reports[:, k]) for k in range(3)])
+        return jnp.stack([jnp.interp(time, context.report_times, context.reports[:, k]) for k in range(3)])
 
-    further = at(moment.time + later) - at(moment.time)
-    then = eqx.tree_at(lambda one: one.time, model, model.time + later)
-    return _taken(then, then.tool + jnp.where(moment.closed > 0, further, 0.0))
-
-
-def _taken(model: SheetModel, way: Float[Array, " 3"]) -> SheetModel:
-    return eqx.tree_at(lambda one: one.tool, model, way)
+    change = at(context.time + later) - at(context.time)
+    shifted = eqx.tree_at(lambda m: m.time, model, model.time + later)
+    return _with_tool(shifted, shifted.tool + jnp.where(context.closed > 0, change, 0.0))
 
 
-def _moved(model: SheetModel, shift: Float[Array, " 3"], turn: Float[Array, " 3"]) -> SheetModel:
+def _with_tool(model: SheetModel, displacement: Float[Array, " 3"]) -> SheetModel:
+    """Return the model with another displacement of the tool [m]."""
+    return eqx.tree_at(lambda m: m.tool, model, displacement)
+
+
+def _with_pose(model: SheetModel, shift: Float[Array, " 3"], rotation_vector: Float[Array, " 3"]) -> SheetModel:
+    """Return the model whose view is shifted [m] and rotated [rad] in addition."""
     view = model.view
-    changed = view.shift + shift, _rotation(turn) @ view.turn
-    return eqx.tree_at(lambda one: (one.view.shift, one.view.turn), model, changed)
+    changed = view.shift + shift, _rotation(rotation_vector) @ view.rotation
+    return eqx.tree_at(lambda m: (m.view.shift, m.view.rotation), model, changed)
 
 
-def _rotation(turn: Float[Array, " 3"]) -> Float[Array, "3 3"]:
-    """About an axis by its length: Rodrigues' formula, by its series where the angle is small."""
-    x, y, z = turn
-    none = jnp.zeros_like(x)
-    cross = jnp.stack([jnp.stack([none, -z, y]), jnp.stack([z, none, -x]), jnp.stack([-y, x, none])])
-    square = jnp.sum(turn**2)
+def _rotation(rotation_vector: Float[Array, " 3"]) -> Float[Array, "3 3"]:
+    """Return the rotation about a vector by its length [rad]: Rodrigues' formula, by its series at small angles."""
+    x, y, z = rotation_vector
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    square = jnp.sum(rotation_vector**2)
     small = square < SMALL_ANGLE**2
     safe = jnp.where(small, 1.0, square)
     angle = jnp.sqrt(safe)

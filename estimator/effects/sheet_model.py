@@ -1,7 +1,7 @@
-"""One sheet's model for one frame, as far as an effect may change it: its energy, its tool, and how it is seen.
+"""One sheet's model for one frame, as far as an effect may change it: its energy, its tool, and how it is observed.
 
-The energy has its terms by kind, so that an effect finds the one that it changes; terms that only effects use are there
-from the start, at nothing.
+The energy has its terms by type, so that an effect finds the one that it changes. Terms that only effects use are there
+from the start, with zero energy.
 """
 
 from typing import TypeVar
@@ -23,60 +23,67 @@ from .terms import AdhesionFilm, DeadLoad, FrictionElements
 
 Kind = TypeVar("Kind", bound=Term)
 
-SHORTEST = 1e-3
-"""Time constant below which what follows does so at once where the tool stands [s]."""
-STOOD = 1e-4
-"""Way up to which the tool as well stood: its reports are no better [m]."""
+MIN_TIME_CONSTANT = 1e-3
+"""Time constant that a smaller one is taken as inside an exponential [s], far below the time between reports."""
+RESTING_DISPLACEMENT = 1e-4
+"""Displacement of the tool that counts as much as resting: its reports are no more precise [m]."""
 
 
 class View(eqx.Module):
-    """How positions are seen: `shift` + `centre` + `turn` (x - `centre`), of what is followed on the sheet's surface.
+    """Observation of positions: `shift` + `centre` + `rotation` (x - `centre`) of points on the sheet's surface.
 
-    The surface lies above the sheet's middle, where its forces are, and a sheet that turns takes it along. At rest it
-    is where the sheet was seen, so that particles at x have theirs at x + `height` (normal - `lying`).
+    The surface lies above the middle surface, where the forces act, and rotates with it. At rest it is where the sheet
+    was observed, so that the surface over a particle at x is at x + `height` (normal - `rest_normals`).
     """
 
     centre: Float[Array, " 3"]
-    """The middle of the sheet at rest [m]."""
-    turn: Float[Array, "3 3"]
+    """Middle of the sheet at rest [m]."""
+    rotation: Float[Array, "3 3"]
+    """Rotation, and scale, of all that is observed."""
     shift: Float[Array, " 3"]
-    """[m]."""
-    followed: SurfacePoints
+    """Displacement of all that is observed [m]."""
+    points: SurfacePoints
+    """Points of the sheet that are observed as the particles."""
     height: Float[Array, ""]
-    """Of the surface over the middle [m]."""
-    lying: Float[Array, "n 3"]
-    """Normals at rest."""
+    """Height of the observed surface over the middle surface [m]."""
+    rest_normals: Float[Array, "n 3"]
+    """Unit normals at rest."""
 
     def __call__(self, x: Float[Array, "n 3"], *, tangents: Float[Array, "n 3 2"]) -> Float[Array, "n 3"]:
-        """Where what is followed is seen, for particles at x and the sheet's derivatives there."""
-        return self.moved(self.followed(x + self.height * (_normals(tangents) - self.lying), tangents))
+        """Return the observed positions [m], for particles at x [m] and the sheet's derivatives there."""
+        return self.moved(self.points(x + self.height * (_normals(tangents) - self.rest_normals), tangents))
 
     def moved(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """Where points at x are seen."""
-        return self.centre[None] + self.shift[None] + (x - self.centre[None]) @ self.turn.T
+        """Return where points at x are observed [m]."""
+        return self.centre[None] + self.shift[None] + (x - self.centre[None]) @ self.rotation.T
 
 
 class SheetModel(eqx.Module):
-    """Of one frame."""
+    """Model of the sheet in one frame."""
 
     energy: SheetEnergy
-    """Its `rest` are the anchors of the attachments."""
+    """Energy of the sheet; its `rest` are the anchors of the attachments."""
     tool: Float[Array, " 3"]
-    """How far the jaws have taken what they hold since they closed [m]."""
+    """Displacement of what the jaws hold since they closed [m]."""
     view: View
+    """How positions are observed."""
     time: Float[Array, ""]
-    """By the clock of the tool's reports, when what is seen was so [s]."""
+    """Time of the observed state, by the clock of the tool's reports [s]."""
 
     def has(self, kind: type[Term]) -> bool:
-        """Whether the energy has a term of a kind: a sheet in the air has no bed."""
+        """Return whether the energy has a term of a type: a sheet in the air has no bed."""
         return any(isinstance(term, kind) for term in self.energy.terms)
 
     def term(self, kind: type[Kind]) -> Kind:
-        """The energy's term of a kind."""
+        """Return the energy's term of a type.
+
+        Raises:
+            StopIteration: there is none; see `has`.
+        """
         return next(term for term in self.energy.terms if isinstance(term, kind))
 
     def with_term(self, new: Term) -> "SheetModel":
-        """With another term in the place of the one of its kind."""
+        """Return the model with another term in the place of the one of its type."""
         terms = tuple(new if type(term) is type(new) else term for term in self.energy.terms)
         return eqx.tree_at(lambda model: model.energy.terms, self, terms)
 
@@ -85,60 +92,65 @@ class FrameContext(eqx.Module):
     """What an effect may know of a frame."""
 
     rest: Float[Array, "n 3"]
-    """[m]."""
+    """Rest shape [m]."""
     time: Float[Array, ""]
-    """Since the sheet lay as its rest shape has it [s]."""
+    """Time since the sheet was in its rest shape [s]."""
     gap: Float[Array, ""]
-    """Since the frame before [s]."""
+    """Time since the frame before [s]."""
     earlier_gap: Float[Array, ""]
-    """From the one before that to the frame before [s]."""
+    """Time between the two frames before [s]."""
     closed: Float[Array, ""]
-    """Since the jaws closed [s]."""
+    """Time since the jaws closed [s]."""
     now: Float[Array, "n 3"]
-    """The frame's own state, as far as it is known already [m]."""
+    """State of the frame itself, as known so far [m]."""
     before: Float[Array, "n 3"]
-    """State of the frame before; where the jaws have just closed, as it lay [m]."""
+    """State of the frame before; the frame's own where the jaws have just closed [m]."""
     earlier: Float[Array, "n 3"]
-    """Of the one before that [m]."""
+    """State of the frame before that [m]."""
     report_times: Float[Array, " reports"]
-    """When the tool's way was reported during this grasp [s], as `time`; beyond the last, it stood."""
+    """Times of the tool's reports during this grasp [s], like `time`; after the last one the tool rests."""
     reports: Float[Array, "reports 3"]
-    """The way since the jaws closed [m]."""
+    """Reported displacements of the tool since the jaws closed [m]."""
     past: Float[Array, "frames n 3"]
     """States of all frames with closed jaws [m]."""
     began: Float[Array, " frames"]
-    """When the tissue went to each of these states [s]."""
+    """Time at which the tissue started to move to each of these states [s]."""
     ended: Float[Array, " frames"]
-    """When it was last there [s]."""
+    """Time at which it was last there [s]."""
 
-    def faded(self, rate: Float[Array, ""]) -> Float[Array, " frames"]:
-        """What a memory that follows at a rate [1/s] holds of each state by now; it began at rest."""
+    def memory_weights(self, rate: Float[Array, ""]) -> Float[Array, " frames"]:
+        """Return the weight of each past state in a memory that follows the state at a rate [1/s], from rest on."""
         until, since = (jnp.where(at <= self.time, jnp.exp(-rate * (self.time - at)), 0.0) for at in self._spans())
         return until - since
 
-    def left_behind(self, constant: Float[Array, ""]) -> Float[Array, ""]:
-        """Share of the step since the frame before that what follows with a time constant [s] still has to go.
+    def lag_share(self, constant: Float[Array, ""]) -> Float[Array, ""]:
+        """Return the share of the step since the frame before that a lag of first order has not covered yet.
 
-        It follows the tool's reported way; where the tool stood, it had all that time.
+        The lag follows the tool's reported displacement. Where the tool rested, it had the whole time.
+
+        Args:
+            constant: time constant of the lag [s].
         """
-        over = jnp.maximum(constant, SHORTEST)
+        time_constant = jnp.maximum(constant, MIN_TIME_CONSTANT)
         ago = self.time - jnp.clip(self.report_times, self.time - self.gap, self.time)
-        lasted = ago[:-1] - ago[1:]
-        way = jnp.linalg.norm(jnp.diff(self.reports, axis=0), axis=1)
-        way = jnp.where(lasted > 0, way, 0.0)
-        left = constant / jnp.where(lasted > 0, lasted, 1.0) * (jnp.exp(-ago[1:] / over) - jnp.exp(-ago[:-1] / over))
-        stood = jnp.exp(-self.gap / over)
-        return (way @ left + STOOD * stood) / (jnp.sum(way) + STOOD)
+        duration = ago[:-1] - ago[1:]
+        distance = jnp.linalg.norm(jnp.diff(self.reports, axis=0), axis=1)
+        distance = jnp.where(duration > 0, distance, 0.0)
+        decay = jnp.exp(-ago[1:] / time_constant) - jnp.exp(-ago[:-1] / time_constant)
+        lag = constant / jnp.where(duration > 0, duration, 1.0) * decay
+        resting_lag = jnp.exp(-self.gap / time_constant)
+        return (distance @ lag + RESTING_DISPLACEMENT * resting_lag) / (jnp.sum(distance) + RESTING_DISPLACEMENT)
 
     def _spans(self) -> tuple[Float[Array, " frames"], Float[Array, " frames"]]:
+        """Return when each past state ended and began, infinite for a state that is not past yet [s]."""
         return self.ended, jnp.where(self.ended <= self.time, self.began, jnp.inf)
 
 
 def nominal_energy(mesh: SheetMesh, declaration: Declaration) -> SheetEnergy:
-    """The declared sheet's energy with all the terms that effects may need.
+    """Return the declared sheet's energy with all terms that effects may need.
 
     Raises:
-        ValueError: its membrane is not of triangles.
+        ValueError: the membrane is not made of triangles.
     """
     energy = surrogate(mesh, declaration)
     terms: tuple[Term, ...] = energy.terms
@@ -149,38 +161,40 @@ def nominal_energy(mesh: SheetMesh, declaration: Declaration) -> SheetEnergy:
 
 
 def tangents(membrane: TriangleMembrane, x: Float[Array, "n 3"]) -> Float[Array, "n 3 2"]:
-    """Derivative of the position along the two material axes, at each particle the mean of its triangles'."""
+    """Return the derivative of the position along the material axes, at each particle the mean of its triangles'."""
     F = membrane.deformation(x[membrane.vertices])
-    spread = jnp.broadcast_to((membrane.area[:, None, None] * F)[:, None], (*membrane.vertices.shape, 3, 2))
-    total = jnp.zeros((len(x), 3, 2), x.dtype).at[membrane.vertices].add(spread)
-    around = jnp.zeros(len(x), x.dtype).at[membrane.vertices].add(membrane.area[:, None])
-    return total / around[:, None, None]
+    weighted = jnp.broadcast_to((membrane.area[:, None, None] * F)[:, None], (*membrane.vertices.shape, 3, 2))
+    total = jnp.zeros((len(x), 3, 2), x.dtype).at[membrane.vertices].add(weighted)
+    area = jnp.zeros(len(x), x.dtype).at[membrane.vertices].add(membrane.area[:, None])
+    return total / area[:, None, None]
 
 
-def across(membrane: TriangleMembrane, rest: Float[Array, "n 3"], x: Float[Array, "m 3"]) -> Float[Array, "m 2"]:
-    """Places in the plane of the sheet's two mean material axes [m]."""
+def material_coordinates(
+    membrane: TriangleMembrane, rest: Float[Array, "n 3"], x: Float[Array, "m 3"]
+) -> Float[Array, "m 2"]:
+    """Return the coordinates of positions x [m] along the sheet's two mean material axes [m]."""
     return x @ jnp.mean(tangents(membrane, rest), axis=0)
 
 
 def extent(place: Float[Array, "n 2"]) -> tuple[Float[Array, "1 2"], Float[Array, "1 2"]]:
-    """The least and the largest of the sheet's places."""
+    """Return the smallest and the largest of the sheet's coordinates along each axis [m]."""
     return jnp.min(place, axis=0, keepdims=True), jnp.max(place, axis=0, keepdims=True)
 
 
 def centred(mesh: SheetMesh) -> View:
-    """As it is."""
+    """Return a view that observes every particle of the sheet where it is."""
     membrane = TriangleMembrane.build(mesh, stiffness=1.0, poisson=0.0)
     return View(
         centre=jnp.asarray(mesh.rest.mean(axis=0)),
-        turn=jnp.eye(3),
+        rotation=jnp.eye(3),
         shift=jnp.zeros(3),
-        followed=SurfacePoints.themselves(mesh.n),
+        points=SurfacePoints.themselves(mesh.n),
         height=jnp.zeros(()),
-        lying=_normals(tangents(membrane, jnp.asarray(mesh.rest))),
+        rest_normals=_normals(tangents(membrane, jnp.asarray(mesh.rest))),
     )
 
 
 def _normals(tangents: Float[Array, "n 3 2"]) -> Float[Array, "n 3"]:
-    """Unit normals on the side from which triangles run counter-clockwise."""
+    """Return the unit normals on the side from which the triangles run counter-clockwise."""
     normal = jnp.cross(tangents[:, :, 0], tangents[:, :, 1])
     return normal / jnp.linalg.norm(normal, axis=1, keepdims=True)

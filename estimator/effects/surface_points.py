@@ -1,7 +1,7 @@
-"""Which material of the sheet is seen in each particle's place: its own, or what a tracker has slid to.
+"""Points of the sheet that are observed as the particles: the particles themselves, or where a tracker slid to.
 
-A place is a point of the plane that the sheet's two material axes span in the mean; a sheet that lies far from flat is
-not unrolled.
+A place is a point in the plane of the sheet's two mean material axes. A sheet that is far from flat at rest is not
+unrolled.
 """
 
 import equinox as eqx
@@ -9,26 +9,28 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-BEYOND = 1e-3
-"""How far beyond a side a point may be, by the triangle's height: from the outline particles may go either way."""
+MAX_OUTSIDE = 1e-3
+"""Distance by which a point may be outside its triangle [heights of the triangle], so that particles on the outline
+have derivatives both ways."""
 
 
 class SurfacePoints(eqx.Module):
-    """A point of the sheet for each particle, in one of its triangles.
+    """One point of the sheet for each particle, in one of its triangles.
 
-    Between the corners of a triangle the sheet is a cubic Bezier patch with its derivatives there [PN triangles:
-    Vlachos et al. 2001, doi:10.1145/364338.364387]: exact where it is quadratic, and smooth at the particles.
+    Inside a triangle the sheet is a cubic Bezier patch with the sheet's derivatives at the corners [PN triangles:
+    Vlachos et al. 2001, doi:10.1145/364338.364387]. It is exact for a quadratic sheet, and smooth at the particles.
     """
 
     corners: Int[Array, "n 3"]
+    """Particles at the corners of the triangle."""
     weights: Float[Array, "n 3"]
-    """Barycentric."""
+    """Barycentric coordinates."""
     sides: Float[Array, "n 3 3 2"]
-    """From each corner to each, in the sheet [m]."""
+    """Vectors from each corner to each other, in places of the sheet [m]."""
 
     @classmethod
     def themselves(cls, n: int) -> "SurfacePoints":
-        """The particles."""
+        """Return n points that are the particles themselves."""
         return cls(
             corners=jnp.broadcast_to(jnp.arange(n)[:, None], (n, 3)),
             weights=jnp.broadcast_to(jnp.asarray([1.0, 0.0, 0.0]), (n, 3)),
@@ -37,22 +39,28 @@ class SurfacePoints(eqx.Module):
 
     @classmethod
     def at(cls, triangles: Int[Array, "f 3"], place: Float[Array, "n 2"], to: Float[Array, "n 2"]) -> "SurfacePoints":
-        """Material at places [m], where particles are at `place`; what is beyond the outline stops near it."""
-        slope, first = _slopes(place[triangles]), jnp.eye(3)[:1]
+        """Return the points at given places; beyond the outline they stop near it.
 
-        def own(at: Float[Array, "n 2"]) -> Int[Array, " n"]:
-            every = jnp.broadcast_to(jnp.arange(len(triangles))[:, None], triangles.shape)
-            return jnp.zeros(len(at), dtype=every.dtype).at[triangles].set(every)
+        Args:
+            triangles: particles at the corners of each triangle.
+            place: of the particles [m].
+            to: places of the points [m].
+        """
+        gradient, first = _barycentric_gradients(place[triangles]), jnp.eye(3)[:1]
 
-        def around(at: Float[Array, "n 2"]) -> Int[Array, " n"]:
-            start = jnp.einsum("fka,fa->fk", slope, place[triangles[:, 0]]) - first
-            return jnp.argmax(jnp.min(jnp.einsum("fka,na->nfk", slope, at) - start[None], axis=2), axis=1)
+        def own_triangle(at: Float[Array, "n 2"]) -> Int[Array, " n"]:
+            index = jnp.broadcast_to(jnp.arange(len(triangles))[:, None], triangles.shape)
+            return jnp.zeros(len(at), dtype=index.dtype).at[triangles].set(index)
 
-        still = jax.lax.stop_gradient(to)
-        triangle = jax.lax.cond(jnp.all(still == place), own, around, still)
+        def containing_triangle(at: Float[Array, "n 2"]) -> Int[Array, " n"]:
+            start = jnp.einsum("fka,fa->fk", gradient, place[triangles[:, 0]]) - first
+            return jnp.argmax(jnp.min(jnp.einsum("fka,na->nfk", gradient, at) - start[None], axis=2), axis=1)
+
+        fixed = jax.lax.stop_gradient(to)
+        triangle = jax.lax.cond(jnp.all(fixed == place), own_triangle, containing_triangle, fixed)
         corners = triangles[triangle]
-        weights = first + jnp.einsum("nka,na->nk", slope[triangle], to - place[corners[:, 0]])
-        weights = jnp.maximum(weights, -BEYOND)
+        weights = first + jnp.einsum("nka,na->nk", gradient[triangle], to - place[corners[:, 0]])
+        weights = jnp.maximum(weights, -MAX_OUTSIDE)
         return cls(
             corners=corners,
             weights=weights / jnp.sum(weights, axis=1, keepdims=True),
@@ -60,7 +68,7 @@ class SurfacePoints(eqx.Module):
         )
 
     def __call__(self, x: Float[Array, "n 3"], tangents: Float[Array, "n 3 2"]) -> Float[Array, "n 3"]:
-        """Where they are, for particles at x [m] and the sheet's derivatives there along its material axes."""
+        """Return the positions of the points [m], for particles at x [m] and the sheet's derivatives there."""
         w, at = self.weights, x[self.corners]
         edges = at[:, :, None] + jnp.einsum("nkia,nkja->nkji", tangents[self.corners], self.sides) / 3
         middle = jnp.sum(edges, axis=(1, 2)) / 4 - jnp.sum(at, axis=1) * 5 / 12
@@ -68,9 +76,9 @@ class SurfacePoints(eqx.Module):
         return jnp.einsum("nkj,nkji->ni", share, edges) + 6 * jnp.prod(w, axis=1)[:, None] * middle
 
 
-def _slopes(corners: Float[Array, "f 3 2"]) -> Float[Array, "f 3 2"]:
-    """Derivatives of barycentric coordinates [1/m]."""
+def _barycentric_gradients(corners: Float[Array, "f 3 2"]) -> Float[Array, "f 3 2"]:
+    """Return the gradients of the barycentric coordinates of each triangle [1/m]."""
     opposite = jnp.roll(corners, -2, axis=1) - jnp.roll(corners, -1, axis=1)
-    across = jnp.stack([-opposite[..., 1], opposite[..., 0]], axis=-1)
-    height = jnp.sum(across * (corners - jnp.roll(corners, -1, axis=1)), axis=-1, keepdims=True)
-    return across / height
+    normal = jnp.stack([-opposite[..., 1], opposite[..., 0]], axis=-1)
+    height = jnp.sum(normal * (corners - jnp.roll(corners, -1, axis=1)), axis=-1, keepdims=True)
+    return normal / height

@@ -1,11 +1,11 @@
-"""Elements that only effects use: friction on the bed, a dead load, a film that sticks. One particle each.
+"""Terms of the energy that only effects use, one element a particle: friction on the bed, dead load, adhesion film.
 
-Friction is a potential of the way since the frame before,
+Friction is a potential of the displacement since the frame before,
 
-    mu N (sqrt(|d|^2 + e^2) - e)    d: the way along the bed
+    mu N (sqrt(|d|^2 + e^2) - e)    d: the displacement along the bed
 
-with the pressing force N held fixed [lagged friction: Li et al. 2020, doi:10.1145/3386569.3392425]: for ways longer
-than e it is Coulomb's mu N against the way, and nothing for none.
+with the pressing force N held fixed [lagged friction: Li et al. 2020, doi:10.1145/3386569.3392425]. For displacements
+longer than e the force is Coulomb's mu N against the displacement; for none it is 0.
 """
 
 import jax.numpy as jnp
@@ -14,25 +14,26 @@ from jaxtyping import Array, Float, Int
 
 from ..physics.energy import Term
 
-STICK = 5e-5
-"""e [m]."""
-REACH = 2e-3
-"""Distance at which a film has given most of its energy [m]."""
+STICK_LENGTH = 5e-5
+"""Displacement e over which friction builds up [m], below the noise of observed positions."""
+FILM_RANGE = 2e-3
+"""Distance r at which a film has released most of its energy [m]."""
 
 
 class FrictionElements(Term):
-    """Friction on the bed."""
+    """Friction of each particle on the bed."""
 
     vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
     start: Float[Array, "n 3"]
     """Where the particles were in the frame before [m]."""
     resisted: Float[Array, " n"]
-    """mu N [N]."""
+    """Friction force mu N of sliding [N]."""
     up: Float[Array, " 3"]
+    """Unit normal of the bed."""
 
     @classmethod
     def build(cls, rest: Float[np.ndarray, "n 3"]) -> "FrictionElements":
-        """Without friction."""
+        """Return the elements without friction."""
         return cls(
             vertices=np.arange(len(rest))[:, None],
             start=jnp.asarray(rest),
@@ -41,75 +42,76 @@ class FrictionElements(Term):
         )
 
     def energy(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
-        """[J]."""
-        _, length = self._way(x)
-        return self.resisted * (length - STICK)
+        """Return the energy of each element [J]."""
+        _, length = self._displacement(x)
+        return self.resisted * (length - STICK_LENGTH)
 
     def gradient(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3"]:
-        """[N]."""
-        way, length = self._way(x)
-        return (self.resisted / length)[:, None, None] * way[:, None]
+        """Return the gradient of each element's energy [N]."""
+        d, length = self._displacement(x)
+        return (self.resisted / length)[:, None, None] * d[:, None]
 
     def hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
-        """[N/m]."""
-        way, length = self._way(x)
+        """Return the Hessian of each element's energy [N/m]."""
+        d, length = self._displacement(x)
         flat = jnp.eye(3, dtype=x.dtype) - jnp.outer(self.up, self.up)
-        window = flat[None] - way[:, :, None] * way[:, None, :] / length[:, None, None] ** 2
-        return ((self.resisted / length)[:, None, None] * window)[:, None, :, None, :]
+        curvature = flat[None] - d[:, :, None] * d[:, None, :] / length[:, None, None] ** 2
+        return ((self.resisted / length)[:, None, None] * curvature)[:, None, :, None, :]
 
     def positive_hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
-        """The Hessian, which is semi-definite already."""
+        """Return the Hessian, which is positive semi-definite already."""
         return self.hessian(x)
 
-    def _way(self, x: Float[Array, "n 1 3"]) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
+    def _displacement(self, x: Float[Array, "n 1 3"]) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
+        """Return the displacement along the bed [m], and its regularised length sqrt(|d|^2 + e^2) [m]."""
         moved = x[:, 0] - self.start
-        way = moved - jnp.outer(moved @ self.up, self.up)
-        return way, jnp.sqrt(jnp.sum(way**2, axis=1) + STICK**2)
+        d = moved - jnp.outer(moved @ self.up, self.up)
+        return d, jnp.sqrt(jnp.sum(d**2, axis=1) + STICK_LENGTH**2)
 
 
 class DeadLoad(Term):
-    """A force that stays as it is."""
+    """Constant force on each particle."""
 
     vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
     force: Float[Array, "n 3"]
-    """[N]."""
+    """Force on each particle [N]."""
 
     @classmethod
     def build(cls, rest: Float[np.ndarray, "n 3"]) -> "DeadLoad":
-        """None."""
+        """Return the elements without force."""
         return cls(vertices=np.arange(len(rest))[:, None], force=jnp.zeros(rest.shape))
 
     def energy(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
-        """[J]."""
+        """Return the energy of each element [J]."""
         return -jnp.sum(self.force * x[:, 0], axis=1)
 
     def gradient(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3"]:
-        """[N]."""
+        """Return the gradient of each element's energy [N]."""
         return -self.force[:, None]
 
     def hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
-        """Zero."""
+        """Return zeros, because the energy is linear [N/m]."""
         return jnp.zeros((len(x), 1, 3, 1, 3), x.dtype)
 
     def positive_hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
-        """Zero."""
+        """Return zeros, because the energy is linear [N/m]."""
         return self.hessian(x)
 
 
 class AdhesionFilm(Term):
-    """What holds a particle near where it lay until it is peeled off: w (1 - exp(-|x - a|^2 / r^2))."""
+    """Film that holds each particle near its rest position until it is peeled off: w (1 - exp(-|x - a|^2 / r^2))."""
 
     vertices: Int[np.ndarray, "n 1"] | Int[Array, "n 1"]
     rest: Float[Array, "n 3"]
-    """a [m]."""
+    """Rest positions a [m]."""
     work: Float[Array, " n"]
-    """w, of peeling a particle off [J]."""
+    """Work w of peeling each particle off [J]."""
 
     @classmethod
     def build(cls, rest: Float[np.ndarray, "n 3"]) -> "AdhesionFilm":
-        """A dry sheet."""
+        """Return the elements of a dry sheet, without work."""
         return cls(vertices=np.arange(len(rest))[:, None], rest=jnp.asarray(rest), work=jnp.zeros(len(rest)))
 
     def energy(self, x: Float[Array, "n 1 3"]) -> Float[Array, " n"]:
-        """[J]."""
-        return self.work * -jnp.expm1(-jnp.sum((x[:, 0] - self.rest) ** 2, axis=1) / REACH**2)
+        """Return the energy of each element [J]."""
+        return self.work * -jnp.expm1(-jnp.sum((x[:, 0] - self.rest) ** 2, axis=1) / FILM_RANGE**2)

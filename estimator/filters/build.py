@@ -16,7 +16,7 @@ from .filter import Filter
 from .force_balance import ForceBalance
 from .implicit import ImplicitFilter
 from .nnls import NonNegativeLeastSquares
-from .shots import simulator
+from ..physics.simulator import simulator
 from .unscented import ReducedUnscented
 
 FORCE_LEVEL = 0.07

@@ -1,1 +1,1 @@
-"""Policies: who chooses the next action."""
+"""Planning: policies, which choose the next action, and what they predict with."""

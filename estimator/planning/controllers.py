@@ -1,15 +1,16 @@
 """The paper's controllers: where the tip goes next, with the tissue in the jaws.
 
-All look one step ahead through the paper's simulator f. LG-D and LG-H descend the loss from the tip; SL-D descends it
-from many samples of the workspace and goes a truncated step towards the best; PMP pulls one way and looks at nothing.
+All predict one step with the paper's simulator f. LG-D and LG-H descend the loss from the tip. SL-D descends it from
+many samples of the workspace and takes a truncated step towards the best. PMP pulls in one direction and uses no
+estimate.
 
-The paper's losses add entropy or displacement, energy and workspace without units. Here each is over a scale:
+The paper's losses add entropy or displacement, energy and workspace without units. Here each is divided by a scale:
 
     L_D = -D / D_1cm       + U / U_max + sigma max(0, Omega - 1)
     L_H = ln |I - K J| / n + U / U_max + sigma max(0, Omega - 1)
 
-with U the mean boundary energy, U_max its limit, and D_1cm what a displacement of all particles by 1 cm is worth at the
-prior. The paper states neither sigma, alpha, gamma nor the box that samples are drawn from.
+with U the mean boundary energy, U_max its limit, and D_1cm the value of D for a displacement of all particles by 1 cm
+at the prior. The paper gives neither sigma, alpha, gamma nor the box that samples are drawn from.
 """
 
 from collections.abc import Callable
@@ -26,40 +27,46 @@ from ..physics.simulator import SWEEPS_PER_STEP
 from ..physics.xpbd import XPBD
 from .objectives import boundary_energy, log_shrinkage, outside, uncertainty_weighted_displacement
 
-OUTSIDE = 100.0
+WORKSPACE_WEIGHT = 100.0
 """Sigma: 1 cm below the ground costs as much as the energy's limit."""
-ALPHA = 2e-4
-"""Of the descent [m^2]: a loss that changes by 1 over 1 cm moves the tip by 2 cm."""
-SAMPLES, ITERATIONS, KEPT = 100, 5, 0.1
-"""Of SL-D, and the share of the best samples that the next action begins with."""
+DESCENT_RATE = 2e-4
+"""Alpha, the step of the gradient descent [m^2]: a loss that changes by 1 over 1 cm moves the tip by 2 cm."""
+N_SAMPLES, N_ITERATIONS = 100, 5
+"""SL-D's samples, and the descent steps of each; both from the paper."""
+KEPT_SHARE = 0.1
+"""Share of SL-D's best samples that the search for the next action starts with."""
+PRIOR_LIFT = 0.01
+"""Displacement of all particles that scales D [m]; see D_1cm above."""
+MIN_DISTANCE = 1e-12
+"""Distance that is taken as 0 [m], so that a step of length 0 has no direction instead of NaN."""
 
 Loss = Callable[[Float[Array, " 3"]], Float[Array, ""]]
 
 
 class Situation(eqx.Module):
-    """What a controller knows: the sheet, the grip and the belief of the moment."""
+    """What a controller knows: the sheet, the grip and the current belief."""
 
     x: Float[Array, "n 3"]
     """Positions [m]."""
     tip: Float[Array, " 3"]
-    """[m]."""
+    """Position of the tip [m]."""
     length: Float[Array, " n"]
     """Rest length of each particle's spring to the tip [m]."""
     stiffness: Float[Array, " n"]
-    """Of those springs, zero for particles that are not held [N/m]."""
+    """Stiffness of those springs, zero for particles that are not held [N/m]."""
     b: Float[Array, " n"]
-    """Non-negative mean [N/m]."""
+    """Mean stiffness of the attachments, not negative [N/m]."""
     covariance: Float[Array, "n n"]
-    """Of b [N^2/m^2]."""
+    """Covariance of b [N^2/m^2]."""
 
 
 class Scales(eqx.Module):
-    """What the parts of a loss are measured by."""
+    """Scales by which the terms of a loss are divided."""
 
     displacement: Float[Array, ""]
     """D_1cm [m N^2/m^2]."""
     energy: Float[Array, ""]
-    """U_max, of the mean boundary energy [J]."""
+    """U_max, the limit of the mean boundary energy [J]."""
     noise: Float[Array, ""]
     """Standard deviation of an observed coordinate [m]."""
 
@@ -67,8 +74,15 @@ class Scales(eqx.Module):
     def at_prior(
         cls, rest: Float[Array, "n 3"], covariance: Float[Array, "n n"], *, energy: float, noise: float
     ) -> Self:
-        """Of a sheet at rest whose b has that covariance."""
-        lifted = rest + jnp.array([[0.0, 0.0, 0.01]])
+        """Return the scales for a sheet at rest under the prior.
+
+        Args:
+            rest: positions [m].
+            covariance: of b at the prior [N^2/m^2].
+            energy: limit of the mean boundary energy [J].
+            noise: standard deviation of an observed coordinate [m].
+        """
+        lifted = rest + jnp.array([[0.0, 0.0, PRIOR_LIFT]])
         return cls(
             displacement=uncertainty_weighted_displacement(lifted, rest, covariance),
             energy=jnp.asarray(energy),
@@ -77,32 +91,34 @@ class Scales(eqx.Module):
 
 
 def displacement_loss(simulator: XPBD, situation: Situation, scales: Scales) -> Loss:
-    """L_D of a tip."""
+    """Return L_D as a function of the tip [m]."""
 
     def loss(tip: Float[Array, " 3"]) -> Float[Array, ""]:
-        x = ahead(simulator, situation, tip, situation.b)
-        worth = uncertainty_weighted_displacement(x, simulator.rest, situation.covariance)
-        return _risk(simulator, situation, scales, tip, x) - worth / scales.displacement
+        x = next_state(simulator, situation, tip, situation.b)
+        displacement = uncertainty_weighted_displacement(x, simulator.rest, situation.covariance)
+        return _risk(simulator, situation, scales, tip, x) - displacement / scales.displacement
 
     return loss
 
 
 def entropy_loss(simulator: XPBD, situation: Situation, scales: Scales) -> Loss:
-    """L_H of a tip; n times as much work as L_D."""
+    """Return L_H as a function of the tip [m]; it costs n times as much as L_D."""
 
     def loss(tip: Float[Array, " 3"]) -> Float[Array, ""]:
         def f(b: Float[Array, " n"]) -> Float[Array, "n 3"]:
-            return ahead(simulator, situation, tip, b)
+            return next_state(simulator, situation, tip, b)
 
-        slope = slopes(f, situation.b)
-        worth = log_shrinkage(slope, situation.covariance, scales.noise) / len(slope)
-        return _risk(simulator, situation, scales, tip, f(situation.b)) + worth
+        dx_db = slopes(f, situation.b)
+        entropy_change = log_shrinkage(dx_db, situation.covariance, scales.noise) / len(dx_db)
+        return _risk(simulator, situation, scales, tip, f(situation.b)) + entropy_change
 
     return loss
 
 
-def ahead(simulator: XPBD, situation: Situation, tip: Float[Array, " 3"], b: Float[Array, " n"]) -> Float[Array, "n 3"]:
-    """f(x_t, a, b), the state one step ahead [m]."""
+def next_state(
+    simulator: XPBD, situation: Situation, tip: Float[Array, " 3"], b: Float[Array, " n"]
+) -> Float[Array, "n 3"]:
+    """Return f(x_t, a, b), the state after one step of the tip to `tip` [m]."""
     grip = Grip.of(tip, situation.length, situation.stiffness)
     return simulator.step(situation.x, b, grip, sweeps=SWEEPS_PER_STEP)
 
@@ -110,21 +126,23 @@ def ahead(simulator: XPBD, situation: Situation, tip: Float[Array, " 3"], b: Flo
 def _risk(
     simulator: XPBD, situation: Situation, scales: Scales, tip: Float[Array, " 3"], x: Float[Array, "n 3"]
 ) -> Float[Array, ""]:
+    """Return the energy and workspace terms of both losses."""
     energy = boundary_energy(x, simulator.rest, situation.b) / len(x)
-    return energy / scales.energy + OUTSIDE * outside(tip)
+    return energy / scales.energy + WORKSPACE_WEIGHT * outside(tip)
 
 
 def local_step(loss: Loss, tip: Float[Array, " 3"], *, longest: float | Array) -> Float[Array, " 3"]:
-    """LG-D or LG-H: a_t = a_t-1 - alpha grad L, no further than `longest` [m]."""
-    return _towards(tip, tip - ALPHA * jax.grad(loss)(tip), longest)
+    """Return LG-D's or LG-H's action a_t = a_t-1 - alpha grad L, no further from the tip than `longest` [m]."""
+    return _towards(tip, tip - DESCENT_RATE * jax.grad(loss)(tip), longest)
 
 
 class Samples(eqx.Module):
-    """The tips that SL-D has tried, best first."""
+    """Tips that SL-D has tried, best first."""
 
     tips: Float[Array, "k 3"]
-    """[m]."""
+    """Positions [m]."""
     loss: Float[Array, " k"]
+    """Loss of each; infinite where it is not finite."""
 
 
 def large_step(
@@ -132,46 +150,46 @@ def large_step(
     low: Float[Array, " 3"],
     high: Float[Array, " 3"],
     key: PRNGKeyArray,
-    before: Samples | None = None,
+    previous: Samples | None = None,
     *,
-    samples: int = SAMPLES,
-    iterations: int = ITERATIONS,
+    samples: int = N_SAMPLES,
+    iterations: int = N_ITERATIONS,
 ) -> Samples:
-    """SL-D's search: uniform samples of a box and the best of those before, each descended.
+    """Return SL-D's search: uniform samples of a box and the best previous ones, each moved by gradient descent.
 
     Args:
-        loss: of a tip.
+        loss: function of a tip.
         low: lower corner of the workspace [m].
         high: upper corner [m].
-        key: draws the samples.
-        before: what the search for the last action ended with.
-        samples: how many.
-        iterations: of the descent of each.
+        key: of the samples.
+        previous: result of the search for the last action.
+        samples: number of samples.
+        iterations: descent steps of each.
 
     Returns:
-        Where they ended; those whose loss is no number come last.
+        Where they ended; those whose loss is not finite come last.
     """
     tips = jax.random.uniform(key, (samples, 3), low.dtype, low[None], high[None])
-    if before is not None:
-        kept = round(KEPT * samples)
-        tips = tips.at[:kept].set(before.tips[:kept])
+    if previous is not None:
+        kept = round(KEPT_SHARE * samples)
+        tips = tips.at[:kept].set(previous.tips[:kept])
 
-    def descended(tip: Float[Array, " 3"]) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
-        def one(tip: Float[Array, " 3"], _: None) -> tuple[Float[Array, " 3"], None]:
-            return jnp.clip(tip - ALPHA * jax.grad(loss)(tip), low, high), None
+    def descend(tip: Float[Array, " 3"]) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
+        def step(tip: Float[Array, " 3"], _: None) -> tuple[Float[Array, " 3"], None]:
+            return jnp.clip(tip - DESCENT_RATE * jax.grad(loss)(tip), low, high), None
 
-        tip, _ = jax.lax.scan(one, tip, length=iterations)
+        tip, _ = jax.lax.scan(step, tip, length=iterations)
         return tip, loss(tip)
 
-    tips, found = _each(descended, tips)
-    found = jnp.where(jnp.isfinite(found), found, jnp.inf)
-    order = jnp.argsort(found)
-    return Samples(tips=tips[order], loss=found[order])
+    tips, losses = _map_tips(descend, tips)
+    losses = jnp.where(jnp.isfinite(losses), losses, jnp.inf)
+    order = jnp.argsort(losses)
+    return Samples(tips=tips[order], loss=losses[order])
 
 
-def truncated_step(found: Samples, tip: Float[Array, " 3"], *, longest: float | Array) -> Float[Array, " 3"]:
-    """SL-D's action: towards the best sample by gamma, `longest` [m], or all the way where it is nearer."""
-    return _towards(tip, found.tips[0], longest)
+def truncated_step(samples: Samples, tip: Float[Array, " 3"], *, longest: float | Array) -> Float[Array, " 3"]:
+    """Return SL-D's action: towards the best sample by gamma, `longest` [m], or to the sample where it is nearer."""
+    return _towards(tip, samples.tips[0], longest)
 
 
 PRIMITIVES = {
@@ -181,17 +199,18 @@ PRIMITIVES = {
     "left": (-1.0, 0.0, 0.0),
     "right": (1.0, 0.0, 0.0),
 }
-"""The paper's motion primitives; down is forbidden, as the ground is there."""
+"""Directions of the paper's motion primitives; down is forbidden, because the ground is there."""
 
 
-def _each(function: Callable, tips: Float[Array, "k 3"]):
-    """Of every tip: in turn on a CPU, which is faster there, and at once on a GPU."""
+def _map_tips(function: Callable, tips: Float[Array, "k 3"]):
+    """Return a function of every tip: one by one on a CPU, where that is faster, and vectorised on a GPU."""
     return jax.lax.platform_dependent(
         tips, cpu=lambda tips: jax.lax.map(function, tips), default=lambda tips: jax.vmap(function)(tips)
     )
 
 
 def _towards(tip: Float[Array, " 3"], to: Float[Array, " 3"], longest: float | Array) -> Float[Array, " 3"]:
-    way = to - tip
-    far = jnp.linalg.norm(way)
-    return tip + way * jnp.minimum(1.0, longest / jnp.maximum(far, 1e-12))
+    """Return the point towards `to` that is no further from the tip than `longest` [m]."""
+    displacement = to - tip
+    distance = jnp.linalg.norm(displacement)
+    return tip + displacement * jnp.minimum(1.0, longest / jnp.maximum(distance, MIN_DISTANCE))

@@ -1,20 +1,16 @@
 """Our policy: the pull, here or elsewhere, that is expected to teach most for each step, as far as it is safe.
 
-Each plan looks a few steps ahead from where the jaws are, in several directions, and at lifts from other places. While
-a grasp lasts, a place keeps its worth until it would be the best: what is learned mostly lowers it, so only the best
-are looked at again [lazy greedy: Minoux 1978, doi:10.1007/BFb0006528]. Letting go and grasping again costs `REGRASP`
-steps.
+Each plan predicts pulls of a few steps from where the jaws are, in several directions, and lifts from other places. A
+lift from elsewhere counts with the steps of letting go and grasping again.
 
-Safe is a step after which, in the scenarios of the belief, neither the mean boundary energy nor the force on any
-attachment passes its limit, less a margin, with more than the allowed chance: their square root and it are taken as
-normal over the scenarios. What the energy was predicted to be where the tip is now is held against what the scenarios
-make of where the particles are seen: by as much as it was too low, pulls from here are reckoned with more. Particles
-in the jaws and their neighbours, on which no force can be seen, are taken to be free: inside the sheet no place is
-grasped that is not known to be, and the first is on its edge.
+The energy that was predicted for where the tip is now is compared with what the scenarios give for where the particles
+are observed. Further pulls from here count with that ratio where the prediction was too low. Particles in the jaws and
+their neighbours, on which no force can be observed, are taken to be free. Therefore no place inside the sheet is
+grasped that is not known to be free, and the first grasp is on the border.
 """
 
+from dataclasses import replace
 from itertools import product
-from statistics import NormalDist
 
 import equinox as eqx
 import jax
@@ -28,53 +24,21 @@ from jiggle_mj.limits import Limits
 
 from ..blas import one_thread
 from ..estimator import Estimator
-from ..physics.mesh import SheetMesh, far_apart
+from .grasp_places import GraspPlaces
+from .information_config import DIRECTIONS, InformationPolicyConfig
 from .outcomes import outcomes
-from .policy import STEP, Policy, in_mm
-from .pull_predictor import CandidatePull, Outcome, PullPredictor
+from .plan_safety import PlanSafety, observed_energy_ratio
+from .policy import Policy, in_mm
+from .pull_predictor import CandidatePull, PullPredictor
 from .tool_kinematics import ToolKinematics
 from .workspace import Workspace
 
-AHEAD = (0.5, 1, 3)
-"""Steps that a pull is followed for, where the jaws are; each direction is worth what the best of them teaches."""
-LIFTS = (1, 3, 6)
-"""Steps of the lifts that other places are judged by."""
-REGRASP = 3
-"""Steps that lowering, letting go and grasping again cost."""
-PLACES = 12
-"""Of grasps, spread over the sheet."""
-TRIED = 3
-"""Pulls, best first, that are looked at for a safe one."""
-EXPECTED, JUDGED = 2, 16
-"""Scenarios that a gain is the mean of, and that a step's safety is judged by."""
-LIKELY = 9
-"""Pulls, best in one scenario, that are looked at in all of them."""
-ENOUGH = 0.004
-"""A gain for which no step is worth taking [nat per particle]."""
-MARGIN = 0.75
-"""Share of the limits that a plan keeps to: it does not know by how much its model errs. A step that all scenarios put
-below the limit has exceeded it by 0.3."""
-SHORTER = (1.0, 0.5)
-"""Shares of a step that are tried, where the whole is not safe."""
-DECIDED = 0.05
-"""P(attached) or P(free) of a particle about which enough is known."""
-KNOWN, SUSPECTED = 0.02, 0.2
-"""P(attached) up to which a place may be grasped, inside the sheet and on its edge."""
-TRIFLE = 0.1
-"""Share of the limit on the energy below which a prediction is not held against what is seen."""
-LOST = 5e-3
-"""Slip from which the tissue is no longer in the jaws [m]."""
-UP = np.array([[0.0, 0.0, 1.0]])
-ALONG = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
-SLANTED = 0.5**0.5 * (ALONG + UP)
-DIRECTIONS = np.concatenate([UP, ALONG, SLANTED])
-"""Up, along the sheet, and between."""
-PULLS = np.kron(DIRECTIONS, STEP * np.array(AHEAD)[:, None])
-"""Where the tip may be pulled from where it is [m]: every direction as far as `AHEAD` says, one after the other."""
+ARRIVED = 0.1
+"""Share of a step within which the tip counts as back where the jaws closed."""
 
 
 class InformationPolicy(Policy):
-    """Plans for one sheet."""
+    """Policy that maximises the expected gain of information per step on one sheet."""
 
     def __init__(
         self,
@@ -84,38 +48,45 @@ class InformationPolicy(Policy):
         seed: int,
         tweezer: ToolKinematics | None = None,
         regrasps: bool = True,
-        enough: float = ENOUGH,
+        min_gain: float | None = None,
         about: Bool[np.ndarray, " n"] | None = None,
+        config: InformationPolicyConfig | None = None,
     ) -> None:
-        """Say what is allowed.
+        """Set what is allowed and what is asked.
 
         Args:
             limits: on the attachments, and on where the tip may go.
             radius: of the jaws [m].
-            seed: draws the scenarios.
+            seed: of the scenarios.
             tweezer: kept clear of the bed; if None, nothing but the tip is known of the tool.
-            regrasps: whether to let go and grasp elsewhere; if not, the jaws are closed by somebody else.
-            enough: a gain for which no step is worth taking [nat per particle].
+            regrasps: whether to let go and grasp elsewhere; if not, somebody else closes the jaws.
+            min_gain: replaces the config's [nat per particle and step].
             about: particles whose attachments are asked about; all if None.
+            config: the policy's numbers; the defaults if None.
         """
         super().__init__()
-        self.regrasps, self._enough, self._about = regrasps, enough, about
-        self._limits, self._radius, self._tweezer, self._key = limits, radius, tweezer, jax.random.key(seed)
-        self._energy, self._force = MARGIN * limits.energy, MARGIN * limits.force
-        self._worth: dict[int, float] = {}
+        config = config or InformationPolicyConfig()
+        self._config = config if min_gain is None else replace(config, min_gain=min_gain)
+        self.regrasps, self._about, self._limits, self._tweezer = regrasps, about, limits, tweezer
+        self._radius, self._key = radius, jax.random.key(seed)
+        self._safety = PlanSafety.within(limits, limit_share=config.limit_share)
+        self._places = GraspPlaces(config, self._safety, radius=radius)
         self._place: int | None = None
-        self._missed: set[int] = set()
         self._leaving = self._over = ""
 
     def leave(self, why: str) -> None:
-        """Plan no more than what it takes to let go."""
+        """Plan no more than what it takes to let go.
+
+        Args:
+            why: what the policy then says.
+        """
         self._over = why
 
     def refused(self, error: ActionError) -> bool:
         """See `Policy.refused`: where the jaws have missed the tissue, they are not closed again."""
         if self._place is None:
             return super().refused(error)
-        self._missed.add(self._place)
+        self._places.missed.add(self._place)
         return True
 
     def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
@@ -129,183 +100,123 @@ class InformationPolicy(Policy):
                 return self._grasp(estimator, predictor) if self.regrasps else self._leaving or "nothing is grasped"
             if hold is None:
                 return Release(), "no frame has shown what the jaws hold"
-            if estimator.slip > LOST:
+            if estimator.slip > self._config.max_slip:
                 self._leaving = f"the tissue has slipped out of the jaws by {1e3 * estimator.slip:.0f} mm"
-                return Release(), self._leaving
             if self._leaving:
                 return Release(), self._leaving
-            enough = self._enough * len(estimator.sheet.rest)
-            found = None if self._over else self._best_pull(estimator, predictor)
+            pull = None if self._over else self.best_pull(estimator, predictor)
             if self._over:
                 self._leaving = self._over
-            elif found is not None:
-                to, rate = found
-                elsewhere = self._best_place(estimator, predictor, above=rate) if self.regrasps else None
-                if rate >= enough and elsewhere is None:
+            elif pull is not None:
+                to, rate = pull
+                elsewhere = self._best_place(estimator, predictor, min_rate=rate) if self.regrasps else None
+                if rate >= self._config.min_gain * len(estimator.sheet.rest) and elsewhere is None:
                     return Move(to=to), f"{rate:.0f} nat a step"
                 self._leaving = "another place teaches more" if elsewhere is not None else "little is left to learn"
-            elif self._reached(estimator, tool.position + STEP * DIRECTIONS).any():
+            elif self._reached(estimator, tool.position + self._config.step * DIRECTIONS).any():
                 self._leaving = "no pull from here is safe"
             else:
                 self._leaving = f"the tip at {in_mm(tool.position)} is out of reach, or the tool touches the bed"
             if not self.regrasps:
                 return self._leaving
-            if np.linalg.norm(tool.position - hold.tip) < STEP / 10:
+            if np.linalg.norm(tool.position - hold.tip) < ARRIVED * self._config.step:
                 return Release(), self._leaving
             return Move(to=hold.tip), self._leaving
 
-    def _grasp(self, estimator: Estimator, predictor: PullPredictor) -> tuple[Action, str] | str:
-        self._leaving = ""
-        if self._over:
-            return self._over
-        probability = np.asarray(predictor.mixture.attached)
-        unsure = np.asarray(predictor.about) & (np.minimum(probability, 1 - probability) > DECIDED)
-        if not unsure.any():
-            return f"enough is known: every P(attached) is below {DECIDED:g} or above {1 - DECIDED:g}"
-        enough, self._worth = self._enough * len(unsure), dict.fromkeys(self._worth, np.inf)
-        place = self._best_place(estimator, predictor, above=enough)
-        if not self._worth:
-            return "no place of the sheet is within the tool's reach"
-        if place is None:
-            return f"no safe pull teaches {enough:.2g} nat a step; {int(unsure.sum())} of {len(unsure)} are not decided"
-        self._place = place
-        return Grasp(point=estimator.positions[place], radius=self._radius), f"{self._worth[place]:.0f} nat a step"
+    def best_pull(self, estimator: Estimator, predictor: PullPredictor) -> tuple[Float[np.ndarray, " 3"], float] | None:
+        """Return where the tip goes next [m], and the expected gain of each step of that pull [nat].
 
-    def _best_pull(
-        self, estimator: Estimator, predictor: PullPredictor
-    ) -> tuple[Float[np.ndarray, " 3"], float] | None:
-        """Where the tip goes next, and what each step that way is expected to teach [nat]; None if nothing is safe."""
-        hold, tool = estimator.hold, estimator.tool
+        Args:
+            estimator: with tissue in the jaws.
+            predictor: predicts the pulls.
+
+        Returns:
+            None if no pull is safe.
+        """
+        config, hold, tool = self._config, estimator.hold, estimator.tool
         assert hold is not None and tool is not None
-        few, many = self._drawn(predictor)
-        start = estimator.positions
+        gain_scenarios, safety_scenarios = self._draw_scenarios(predictor)
+        start, force_unknown = jnp.asarray(estimator.positions), jnp.asarray(estimator.force_unknown(hold.held))
 
         def candidates(tips: Float[np.ndarray, "k 3"]) -> CandidatePull:
-            return self._candidates(estimator, hold.held, start, hold.closed_at + (tips - hold.tip)[:, None])
+            to = jnp.asarray(hold.closed_at + (tips - hold.tip)[:, None])
+            return CandidatePull.of_grip(start=start, held=jnp.asarray(hold.held), force_unknown=force_unknown, to=to)
 
-        more = underrated(predictor, candidates(tool.position[None]), many, least=TRIFLE * self._limits.energy)
+        energy_ratio = observed_energy_ratio(
+            predictor,
+            candidates(tool.position[None]),
+            safety_scenarios,
+            min_energy=config.min_checked_energy * self._limits.energy,
+        )
 
-        ends, ahead = tool.position + PULLS, np.tile(AHEAD, len(DIRECTIONS))
+        ends, lengths = tool.position + config.pulls, np.tile(config.pull_lengths, len(DIRECTIONS))
         reached = self._reached(estimator, ends)
 
         def rates(which: Int[np.ndarray, " k"], s: Float[Array, "_few n"]) -> Float[np.ndarray, " k"]:
-            gain = self._allowed_gain(outcomes(predictor, candidates(ends[which]), s), more=more).mean(axis=1)
-            return np.where(reached[which], gain / np.maximum(ahead[which], 1), 0.0)
+            found = outcomes(predictor, candidates(ends[which]), s)
+            gain = self._safety.allowed_gain(found, energy_ratio=energy_ratio).mean(axis=1)
+            return np.where(reached[which], gain / np.maximum(lengths[which], 1), 0.0)
 
-        first = rates(np.arange(len(ends)), few[:1])
-        likely = np.argsort(-first)[:LIKELY]
+        n = config.n_gain_scenarios
+        first = rates(np.arange(len(ends)), gain_scenarios[:1])
+        refined = np.argsort(-first)[: config.n_refined_pulls]
         rate = np.zeros(len(ends))
-        rate[likely] = (first[likely] + (EXPECTED - 1) * rates(likely, few[1:])) / EXPECTED
-        best = [i for i in np.argsort(-rate)[:TRIED] if rate[i] > 0]
-        for share, i in product(SHORTER, best):
-            tip = tool.position + share * STEP * min(ahead[i], 1) * DIRECTIONS[i // len(AHEAD)]
-            if self._safe(predictor, candidates(tip[None]), many, more=more):
+        rate[refined] = (first[refined] + (n - 1) * rates(refined, gain_scenarios[1:])) / n
+        best = [i for i in np.argsort(-rate)[: config.n_safety_checks] if rate[i] > 0]
+        for share, i in product(config.step_shares, best):
+            direction = DIRECTIONS[i // len(config.pull_lengths)]
+            tip = tool.position + share * config.step * min(lengths[i], 1) * direction
+            if self._safety.is_safe(predictor, candidates(tip[None]), safety_scenarios, energy_ratio=energy_ratio):
                 return tip, float(rate[i])
         return None
 
-    def _best_place(self, estimator: Estimator, predictor: PullPredictor, *, above: float) -> int | None:
-        """The particle from which a lift teaches most for each step; None if that is not more than `above`."""
-        rest = estimator.sheet.rest
-        if not self._worth:
-            self._edge = SheetMesh(rest, estimator.sheet.faces).border
-            places = far_apart(rest, PLACES)
-            self._worth = dict.fromkeys(places[self._reached(estimator, rest[places])].tolist(), np.inf)
-        probability = np.asarray(predictor.mixture.attached)
-        few, many = self._drawn(predictor)
-        here = None if estimator.hold is None else estimator.hold.tip
-        fresh: set[int] = set()
-        while max(self._worth.values(), default=0.0) > above:
-            best = max(self._worth, key=lambda place: self._worth[place])
-            held = np.linalg.norm(rest - rest[best], axis=1) <= self._radius
-            if best in fresh:
-                if self._safe(
-                    predictor, self._candidates(estimator, held, rest, rest[None] + STEP * DIRECTIONS[:1, None]), many
-                ):
-                    return best
-                self._worth[best] = 0.0
-                continue
-            fresh.add(best)
-            at_hand = here is not None and np.linalg.norm(rest[best] - here) < self._radius
-            suspect = probability[estimator.force_unknown(held)].max() > (SUSPECTED if self._edge[best] else KNOWN)
-            barred = at_hand or suspect or best in self._missed
-            self._worth[best] = 0.0 if barred else self._lifted(estimator, predictor, held, few)
-        return None
+    def _grasp(self, estimator: Estimator, predictor: PullPredictor) -> tuple[Action, str] | str:
+        """Plan with open jaws."""
+        self._leaving = ""
+        if self._over:
+            return self._over
+        probability, decided = np.asarray(predictor.mixture.attached), self._config.decided_probability
+        undecided = np.asarray(predictor.about) & (np.minimum(probability, 1 - probability) > decided)
+        if not undecided.any():
+            return f"enough is known: every P(attached) is below {decided:g} or above {1 - decided:g}"
+        min_rate = self._config.min_gain * len(undecided)
+        self._places.forget_rates()
+        place = self._best_place(estimator, predictor, min_rate=min_rate)
+        if not self._places.rates:
+            return "no place of the sheet is within the tool's reach"
+        if place is None:
+            count = f"{int(undecided.sum())} of {len(undecided)} are not decided"
+            return f"no safe pull teaches {min_rate:.2g} nat a step; {count}"
+        self._place = place
+        grasp = Grasp(point=estimator.positions[place], radius=self._radius)
+        return grasp, f"{self._places.rates[place]:.0f} nat a step"
 
-    def _lifted(
-        self, estimator: Estimator, predictor: PullPredictor, held: Bool[np.ndarray, " n"], few: Float[Array, "_few n"]
-    ) -> float:
-        """What each step of a lift is expected to teach [nat], letting go and grasping counted.
-
-        In each scenario the lift ends where it would no longer be allowed.
-        """
-        rest, heights = estimator.sheet.rest, STEP * np.array(LIFTS)
-        found = outcomes(
-            predictor, self._candidates(estimator, held, rest, rest[None] + heights[:, None, None] * DIRECTIONS[0]), few
+    def _best_place(self, estimator: Estimator, predictor: PullPredictor, *, min_rate: float) -> int | None:
+        gain_scenarios, safety_scenarios = self._draw_scenarios(predictor)
+        return self._places.best(
+            estimator,
+            predictor,
+            self._workspace(estimator),
+            gain_scenarios=gain_scenarios,
+            safety_scenarios=safety_scenarios,
+            min_rate=min_rate,
         )
-        best = np.maximum.accumulate(self._allowed_gain(found), axis=0)
-        return float((best.mean(axis=1) / (REGRASP + np.array(LIFTS))).max())
+
+    def _workspace(self, estimator: Estimator) -> Workspace:
+        return Workspace.around(estimator, self._limits, self._tweezer)
 
     def _reached(self, estimator: Estimator, tips: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, " k"]:
         assert estimator.tool is not None
-        return Workspace.around(estimator, self._limits, self._tweezer).reached(tips, estimator.tool)
+        return self._workspace(estimator).reached(tips, estimator.tool)
 
-    def _candidates(
-        self,
-        estimator: Estimator,
-        held: Bool[np.ndarray, " n"],
-        start: Float[np.ndarray, "n 3"],
-        to: Float[np.ndarray, "k n 3"],
-    ) -> CandidatePull:
-        """One grip taken to several places."""
-        parts = start, held, estimator.force_unknown(held)
-        start, held, force_unknown = (np.broadcast_to(part, (len(to), *part.shape)) for part in parts)
-        return CandidatePull(
-            start=jnp.asarray(start),
-            held=jnp.asarray(held),
-            force_unknown=jnp.asarray(force_unknown),
-            to=jnp.asarray(to),
-        )
-
-    def _allowed_gain(self, found: Outcome, *, more: float = 1.0) -> Float[np.ndarray, "k scenarios"]:
-        """Gains, 0 where a limit would be passed or nothing finite is predicted; energies count `more` times."""
-        allowed = (more * found.energy <= self._energy) & (found.force <= self._force)
-        return np.where(allowed, np.nan_to_num(found.gain), 0.0)
-
-    def _safe(
-        self, predictor: PullPredictor, candidate: CandidatePull, many: Float[Array, "_many n"], *, more: float = 1.0
-    ) -> bool:
-        """Whether the chance to pass a limit is small enough, by what one tug does in all scenarios."""
-        found, far = (
-            outcomes(predictor, candidate, many, informative=False),
-            NormalDist().inv_cdf(1 - self._limits.chance),
-        )
-        for values, limit in ((jnp.sqrt(more * found.energy), self._energy**0.5), (found.force, self._force)):
-            if not float(jnp.mean(values) + far * jnp.std(values)) <= limit:
-                return False
-        return True
-
-    def _drawn(self, predictor: PullPredictor) -> tuple[Float[Array, "few n"], Float[Array, "many n"]]:
-        self._key, one, other = jax.random.split(self._key, 3)
+    def _draw_scenarios(self, predictor: PullPredictor) -> tuple[Float[Array, "few n"], Float[Array, "many n"]]:
+        """Draw the scenarios that gains are the mean of, and those that decide whether a pull is safe."""
+        self._key, gain_key, safety_key = jax.random.split(self._key, 3)
         unknown = jnp.asarray(self._limits.unknown)
-        return _scenarios(predictor, one, EXPECTED, unknown), _scenarios(predictor, other, JUDGED, unknown)
-
-
-def underrated(
-    predictor: PullPredictor, candidate: CandidatePull, s: Float[Array, "scenarios n"], *, least: float
-) -> float:
-    """How many times the predicted energy what is seen amounts to, over scenarios in the median; at least 1.
-
-    Args:
-        predictor: what is predicted from.
-        candidate: to where the tip is, from where the particles are seen.
-        s: the scenarios.
-        least: less than this is not predicted [J].
-    """
-    squared = jnp.sum((candidate.start[0] - predictor.balance.energy.rest) ** 2, axis=1)
-    b = predictor.balance.reference * s / (1 - s)
-    seen = 0.5 * jnp.median(b @ squared) / len(squared)
-    predicted = jnp.median(outcomes(predictor, candidate, s, informative=False).energy)
-    return max(1.0, float(seen / jnp.maximum(predicted, least)))
+        return (
+            _scenarios(predictor, gain_key, self._config.n_gain_scenarios, unknown),
+            _scenarios(predictor, safety_key, self._config.n_safety_scenarios, unknown),
+        )
 
 
 @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""What many pulls would show and cost in many tissues that could be: `PullPredictor.outcome` of every pair of them."""
+"""Predict many pulls in many scenarios: `PullPredictor.outcome` of every pair of them."""
 
 import math
 
@@ -12,52 +12,64 @@ from jaxtyping import Array, Float
 from .pull_predictor import CandidatePull, Outcome, PullPredictor
 
 BATCH = 32
-"""Pairs of pull and scenario that GPUs look at together: one compilation serves any number of either."""
+"""Pairs of pull and scenario that GPUs predict together. With a fixed number one compilation serves all."""
 
 
 def outcomes(
     predictor: PullPredictor, candidates: CandidatePull, s: Float[Array, "scenarios n"], *, informative: bool = True
 ) -> Outcome:
-    """Of each tug in each scenario: many at once on GPUs, in turn on a CPU."""
+    """Return the outcome of each pull in each scenario: in batches on GPUs, one by one on a CPU.
+
+    Args:
+        predictor: predicts each.
+        candidates: k pulls.
+        s: the scenarios.
+        informative: whether to compute the gains.
+
+    Returns:
+        Arrays of shape (k, scenarios, ...).
+    """
     if jax.default_backend() != "cpu":
-        return at_once(predictor, candidates, s, informative=informative)
-    each_tug = [jax.tree.map(lambda leaf, i=i: leaf[i], candidates) for i in range(len(candidates.to))]
-    found = [[_outcome(predictor, candidate, one, informative=informative) for one in s] for candidate in each_tug]
+        return outcomes_in_batches(predictor, candidates, s, informative=informative)
+    pulls = [jax.tree.map(lambda leaf, i=i: leaf[i], candidates) for i in range(len(candidates.to))]
+    found = [[_outcome(predictor, pull, scenario, informative=informative) for scenario in s] for pull in pulls]
     stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *row) for row in found]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked)
 
 
-def at_once(
+def outcomes_in_batches(
     predictor: PullPredictor, candidates: CandidatePull, s: Float[Array, "scenarios n"], *, informative: bool = True
 ) -> Outcome:
-    """The same in batches, the pairs of each dealt out to all devices, each of which iterates for itself."""
+    """Return the same as `outcomes`, in batches whose pairs are split over all devices; each iterates by itself."""
     shape = len(candidates.to), len(s)
     pairs = np.resize(np.arange(math.prod(shape)), (-(-math.prod(shape) // BATCH), BATCH))
     found = []
     for batch in pairs:
         pulls = jax.tree.map(lambda leaf, batch=batch: leaf[batch // len(s)], candidates)
-        found.append(_dealt(predictor, pulls, s[batch % len(s)], informative=informative))
-    whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: math.prod(shape)], *found)
-    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
+        found.append(_batch_outcomes(predictor, pulls, s[batch % len(s)], informative=informative))
+    flat = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: math.prod(shape)], *found)
+    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), flat)
 
 
 @eqx.filter_jit
-def _dealt(predictor: PullPredictor, pulls: CandidatePull, s: Float[Array, "batch n"], *, informative: bool) -> Outcome:
-    """Of each pull in its own scenario."""
-    known, rest = eqx.partition(predictor, eqx.is_array)
+def _batch_outcomes(
+    predictor: PullPredictor, pulls: CandidatePull, s: Float[Array, "batch n"], *, informative: bool
+) -> Outcome:
+    """Return the outcome of each pull in its own scenario."""
+    arrays, static = eqx.partition(predictor, eqx.is_array)
     devices = jax.devices()[: math.gcd(BATCH, len(jax.devices()))]
 
-    def some(known: PullPredictor, pulls: CandidatePull, s: Float[Array, "some n"]) -> Outcome:
-        whole = eqx.combine(known, rest)
-        return jax.vmap(lambda pull, one: _outcome(whole, pull, one, informative=informative))(pulls, s)
+    def on_device(arrays: PullPredictor, pulls: CandidatePull, s: Float[Array, "share n"]) -> Outcome:
+        combined = eqx.combine(arrays, static)
+        return jax.vmap(lambda pull, scenario: _outcome(combined, pull, scenario, informative=informative))(pulls, s)
 
-    mesh, dealt, everywhere = Mesh(np.array(devices), ("pairs",)), PartitionSpec("pairs"), PartitionSpec()
-    shared = jax.shard_map(some, mesh=mesh, in_specs=(everywhere, dealt, dealt), out_specs=dealt, check_vma=False)
-    return shared(known, pulls, s)
+    mesh, split, replicated = Mesh(np.array(devices), ("pairs",)), PartitionSpec("pairs"), PartitionSpec()
+    sharded = jax.shard_map(on_device, mesh=mesh, in_specs=(replicated, split, split), out_specs=split, check_vma=False)
+    return sharded(arrays, pulls, s)
 
 
 def _outcome(
     predictor: PullPredictor, candidate: CandidatePull, s: Float[Array, " n"], *, informative: bool
 ) -> Outcome:
-    """What is held by the jaws is not held by attachments."""
+    """Return the outcome of one pull; what the jaws hold is not held by attachments too."""
     return predictor.outcome(candidate, jnp.where(candidate.force_unknown, 0.0, s), informative=informative)

@@ -1,7 +1,7 @@
 """The paper's policies: one grasp, held from beginning to end, moved by one of its controllers.
 
-They see the tissue through the paper's simulator, with the stiffness of those particles that are called attached, and
-none elsewhere: the mean of a belief that knows little is a little stiffness everywhere, which no tissue has.
+They predict the tissue with the paper's simulator. It has the stiffness of the particles that are detected as attached,
+and none elsewhere: the mean of a vague belief is a small stiffness everywhere, which no tissue has.
 """
 
 from abc import abstractmethod
@@ -23,8 +23,8 @@ from ..physics.mesh import SheetMesh
 from ..physics.simulator import simulator
 from ..physics.xpbd import XPBD
 from .controllers import (
+    N_SAMPLES,
     PRIMITIVES,
-    SAMPLES,
     Samples,
     Scales,
     Situation,
@@ -37,30 +37,30 @@ from .controllers import (
 from .policy import STEP, Policy
 from .workspace import Workspace
 
-SENSED = 2e-4
-"""Standard deviation of an observed coordinate that LG-H reckons with [m]."""
-STILL = 1e-5
-"""A local step shorter than this has arrived [m]."""
+OBSERVATION_SD = 2e-4
+"""Standard deviation of an observed coordinate in LG-H's entropy [m]."""
+MIN_STEP = 1e-5
+"""A step shorter than this ends the policy, because no step lowers the loss [m]."""
 
 
 class Primitive(Policy):
-    """PMP: pull one way, and look at nothing."""
+    """PMP: pull in one direction, without an estimate."""
 
     def __init__(self, name: str) -> None:
-        """One of `PRIMITIVES`."""
+        """Choose the direction by its name in `PRIMITIVES`."""
         super().__init__()
-        self._way = np.array(PRIMITIVES[name])
+        self._direction = np.array(PRIMITIVES[name])
 
     def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
         """See `Policy.plan`."""
-        return Move(to=_tip(estimator) + STEP * self._way), "the primitive goes on"
+        return Move(to=_tip(estimator) + STEP * self._direction), "the primitive goes on"
 
 
 class Controlled(Policy):
-    """What LG-H, LG-D and SL-D share: simulator, situation and scales."""
+    """Base of LG-H, LG-D and SL-D, which share simulator, situation and scales."""
 
     def __init__(self, limits: Limits, *, seed: int) -> None:
-        """The seed draws samples."""
+        """Keep to the limits; `seed` is of the samples."""
         super().__init__()
         self._limits, self._key = limits, jax.random.key(seed)
         self._simulator: XPBD | None = None
@@ -76,13 +76,13 @@ class Controlled(Policy):
             to = np.asarray(self.choose(self._simulator, situation, Workspace.around(estimator, self._limits)))
         if not np.isfinite(to).all():
             return "the simulator has no finite prediction"
-        if np.linalg.norm(to - np.asarray(situation.tip)) < STILL:
+        if np.linalg.norm(to - np.asarray(situation.tip)) < MIN_STEP:
             return "no step lowers the loss"
         return Move(to=to), "the controller's step"
 
     @abstractmethod
     def choose(self, simulator: XPBD, situation: Situation, workspace: Workspace) -> Float[Array, " 3"]:
-        """Where the tip goes."""
+        """Return where the tip goes [m]."""
 
     def _situation(self, estimator: Estimator) -> Situation:
         hold, detection, k = estimator.hold, estimator.detection, estimator.declaration.membrane_stiffness
@@ -99,14 +99,14 @@ class Controlled(Policy):
 
     def _scaled(self, estimator: Estimator) -> Scales:
         rest, covariance = jnp.asarray(estimator.sheet.rest), jnp.asarray(_covariance(estimator))
-        return Scales.at_prior(rest, covariance, energy=self._limits.energy, noise=SENSED)
+        return Scales.at_prior(rest, covariance, energy=self._limits.energy, noise=OBSERVATION_SD)
 
 
 class Local(Controlled):
-    """LG-H or LG-D: descend a loss from the tip."""
+    """LG-H or LG-D: one step of descent on a loss from the tip."""
 
     def __init__(self, loss: Callable, limits: Limits, *, seed: int) -> None:
-        """`entropy_loss` or `displacement_loss`."""
+        """Descend `entropy_loss` or `displacement_loss`."""
         super().__init__(limits, seed=seed)
         self._loss = loss
 
@@ -116,10 +116,10 @@ class Local(Controlled):
 
 
 class SampledController(Controlled):
-    """SL-D: descend L_D from many samples of the workspace, and go towards the best."""
+    """SL-D: descend L_D from many samples of the workspace, and step towards the best."""
 
     def __init__(self, limits: Limits, *, seed: int) -> None:
-        """The seed draws the samples."""
+        """Keep to the limits; `seed` is of the samples."""
         super().__init__(limits, seed=seed)
         self._samples: Samples | None = None
 
@@ -128,8 +128,8 @@ class SampledController(Controlled):
         low, high = jnp.asarray(workspace.low), jnp.asarray(workspace.high)
         self._key, first, key = jax.random.split(self._key, 3)
         if self._samples is None:
-            drawn = jax.random.uniform(first, (SAMPLES, 3), low.dtype, low[None], high[None])
-            self._samples = Samples(tips=drawn, loss=jnp.full(SAMPLES, jnp.inf))
+            drawn = jax.random.uniform(first, (N_SAMPLES, 3), low.dtype, low[None], high[None])
+            self._samples = Samples(tips=drawn, loss=jnp.full(N_SAMPLES, jnp.inf))
         self._samples = _large(simulator, situation, self._scales, low, high, key, self._samples)
         return truncated_step(self._samples, situation.tip, longest=STEP)
 
@@ -141,9 +141,9 @@ def _tip(estimator: Estimator) -> Float[np.ndarray, " 3"]:
 
 
 def _covariance(estimator: Estimator) -> Float[np.ndarray, "n n"]:
-    """Of b; of a bounded stiffness, as if b were linear in it from 0 on [N^2/m^2].
+    """Return the covariance of b [N^2/m^2]; for a bounded stiffness as if b were linear in it, with the slope at 0.
 
-    The true slope grows without limit towards a weld, which would be all that a controller sees.
+    The true slope grows without limit towards a weld, which would dominate the objective.
     """
     belief = estimator.belief
     return belief.covariance if belief.reference is None else belief.reference**2 * belief.covariance
@@ -162,9 +162,9 @@ def _large(
     low: Float[Array, " 3"],
     high: Float[Array, " 3"],
     key: PRNGKeyArray,
-    before: Samples,
+    previous: Samples,
 ) -> Samples:
-    return large_step(displacement_loss(simulator, situation, scales), low, high, key, before)
+    return large_step(displacement_loss(simulator, situation, scales), low, high, key, previous)
 
 
 PAPER: dict[str, Callable[..., Policy]] = {
@@ -172,4 +172,4 @@ PAPER: dict[str, Callable[..., Policy]] = {
     "lg-d": partial(Local, displacement_loss),
     "lg-h": partial(Local, entropy_loss),
 }
-"""Each takes the limits and a seed."""
+"""The paper's policies by name; each takes the limits and a seed."""

@@ -1,7 +1,7 @@
-"""Who chooses the next action: a policy looks at the estimator, and says what the tool does.
+"""Policies: choose the next action of the tool from the estimate.
 
-Its actions are a generator that goes on when the estimator has taken the observation of the action before. Ends when
-the policy is done, and then says why.
+A policy's actions are a generator. It continues once the estimator has been updated by the observation of the last
+action. It ends when the policy is done, and `Policy.ended` then says why.
 """
 
 import time
@@ -18,60 +18,60 @@ from jiggle_mj.errors import ActionError
 from ..estimator import Estimator
 
 STEP = 5e-3
-"""Gamma: longest way of the tip from one look at the tissue to the next, with tissue in the jaws [m]."""
+"""Gamma: largest displacement of the tip between two observations, with tissue in the jaws [m]."""
 INTERRUPTED = "it was interrupted"
-"""How a policy has ended that was told to stop."""
+"""`Policy.ended` of a policy that was interrupted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """One action that was planned."""
+    """One planned action."""
 
     action: Action
     plan_s: float
     """Wall time of the plan [s]."""
     why: str
-    """In words."""
+    """Reason for the action, for a person to read."""
 
     @property
     def does(self) -> str:
-        """The action in words."""
+        """Return the action in words."""
         match self.action:
-            case Grasp(point=place):
-                return f"grasp at {in_mm(place)}"
-            case Move(to=place):
-                return f"move to {in_mm(place)}"
-            case other:
-                return type(other).__name__.lower()
+            case Grasp(point=position):
+                return f"grasp at {in_mm(position)}"
+            case Move(to=position):
+                return f"move to {in_mm(position)}"
+            case action:
+                return type(action).__name__.lower()
 
 
-def in_mm(place: Float[np.ndarray, " 3"]) -> str:
-    """A place in words."""
-    return f"({', '.join(str(round(1e3 * float(part))) for part in place)}) mm"
+def in_mm(position: Float[np.ndarray, " 3"]) -> str:
+    """Return a position [m] in words, in whole millimetres."""
+    return f"({', '.join(str(round(1e3 * float(part))) for part in position)}) mm"
 
 
 class Policy(ABC):
-    """Plans action after action."""
+    """Base of all policies, which plan one action after the other."""
 
     def __init__(self) -> None:
-        """Nothing planned yet."""
+        """Start without decisions."""
         self.decisions: list[Decision] = []
         self.ended = "it was stopped"
         """Why there are no more actions, once there are none."""
 
     @abstractmethod
     def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
-        """The next action, with words that say why; or, where there is none, why not.
+        """Return the next action and the reason for it; or, where there is none, the reason for that.
 
         Args:
             estimator: after the latest observation.
         """
 
     def refused(self, error: ActionError) -> bool:
-        """Hear that the last action could not be carried out, and say whether to go on; by default it is the end.
+        """Return whether to go on, after the last action could not be carried out; by default not.
 
         Args:
-            error: why not.
+            error: why the action was refused.
         """
         self.ended = f"an action could not be carried out: {error}"
         return False
@@ -79,9 +79,9 @@ class Policy(ABC):
     def actions(
         self, estimator: Estimator, *, steps: int, stop: Callable[[], bool] = lambda: False
     ) -> Iterator[Action]:
-        """At most `steps` actions, and none once `stop` says so.
+        """Yield at most `steps` actions, and none once `stop` returns true.
 
-        An interrupted plan (Ctrl-C) is the end of them too, and what was seen is kept.
+        An interrupted plan (Ctrl-C) ends them too; the results so far are kept.
         """
         for _ in range(steps):
             if stop():

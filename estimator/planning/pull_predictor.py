@@ -1,19 +1,19 @@
-"""What a pull would show and what it would ask of the attachments, as far as the belief can tell.
+"""Predict what a pull would show, and how it would load the attachments, under the current belief.
 
-A belief is many tissues that could be: `scenarios` draws some of them. In each a pull ends in the equilibrium of the
-balance of forces, and what a look at it would add to the belief is known beforehand, as it depends on where the
-particles are, not on what is read off them:
+A belief stands for many possible tissues, and `scenarios` draws some of them. In each, a pull ends in the equilibrium
+of the force balance. The information of an observation there is known beforehand, because it depends on where the
+particles are, not on what is measured:
 
     1/2 ln det(I + Sigma^1/2 D^T N^-1 D Sigma^1/2)
 
-is what a Gaussian belief would gain. Ours is not Gaussian: a particle is free or attached, and a look that just tells
-the two apart teaches far more than its precision says. So the look is taken as one measurement of each particle's s, as
-precise as it makes what is known of it, and the gain is the expected fall of 1/2 ln of that s's variance, summed over
-the particles that are asked about.
+is what a Gaussian belief would gain. Ours is not Gaussian: a particle is free or attached, and an observation that just
+separates the two teaches far more than its precision says. So the observation is taken as one measurement of each
+particle's s, as precise as it makes the Gaussian belief about s. The gain is the expected fall of 1/2 ln of the
+variance of s, summed over the particles that are asked about.
 
-An attachment that nobody knows of yet is in some scenarios and not in others: a risk as well as a hope. How stiff it
-may be, from hardly felt to a weld, would forbid every first pull; so it counts with at most a stiffness that somebody
-types, until it is likelier stiffer than not.
+An attachment that nobody knows of yet is in some scenarios and not in others. Its stiffness may be anything from hardly
+noticeable to a weld, which would forbid every first pull. So it counts with at most a given stiffness
+(`Limits.unknown`) until it is more likely than not stiffer.
 """
 
 import equinox as eqx
@@ -29,9 +29,16 @@ from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
 from ..physics.block_tridiagonal import lower_inverse
 
+QUADRATURE_NODES = 5
+"""Gauss-Hermite nodes for each normal of a mixture."""
+MIN_PRECISION = 1e-6
+"""Smallest precision of a measurement of s, whose scale is 1: it stands for no measurement, and keeps 1 / x finite."""
+MIN_WEIGHT = 1e-300
+"""Smallest weight of a mixture's normal inside a logarithm, just above the smallest float64."""
+
 
 class CandidatePull(eqx.Module):
-    """Tissue in the jaws, and where these take it; one, or many in arrays."""
+    """Tissue in the jaws, and where they take it: one pull, or many in arrays."""
 
     start: Float[Array, "*many n 3"]
     """Positions to search from [m]."""
@@ -41,51 +48,80 @@ class CandidatePull(eqx.Module):
     to: Float[Array, "*many n 3"]
     """Where the held particles go [m]; meaningless for the others."""
 
+    @classmethod
+    def of_grip(
+        cls,
+        *,
+        start: Float[Array, "n 3"],
+        held: Bool[Array, " n"],
+        force_unknown: Bool[Array, " n"],
+        to: Float[Array, "k n 3"],
+    ) -> "CandidatePull":
+        """Return k pulls of one grip, each to its own targets.
+
+        Args:
+            start: positions to search from [m].
+            held: particles in the jaws.
+            force_unknown: see `Evidence.force_unknown`.
+            to: where the held particles go in each pull [m].
+        """
+        start, held, force_unknown = (
+            jnp.broadcast_to(part, (len(to), *part.shape)) for part in (start, held, force_unknown)
+        )
+        return cls(start=start, held=held, force_unknown=force_unknown, to=to)
+
 
 class Outcome(eqx.Module):
-    """Of a tug in one scenario; one, or many in arrays."""
+    """Outcome of a pull in a scenario: one, or many in arrays."""
 
     x: Float[Array, "*many n 3"]
-    """[m]."""
+    """Positions at the end [m]."""
     gain: Float[Array, "*many"]
-    """What entropy is expected to fall by [nat]."""
+    """Expected fall of the entropy [nat]."""
     energy: Float[Array, "*many"]
     """Mean boundary energy [J]."""
     force: Float[Array, "*many"]
-    """Largest on one attachment [N]."""
+    """Largest force on one attachment [N]."""
 
 
 class PullPredictor(eqx.Module):
-    """What is predicted from: the sheet's model, the belief, and how well a particle is seen."""
+    """Predictor of pulls: the sheet's model, the belief, and the precision of an observed particle."""
 
     balance: ForceBalance
     belief: AttachmentBelief
-    precision: Float[Array, "3 3"]
-    """Inverse covariance of a seen particle [1/m^2]."""
+    point_precision: Float[Array, "3 3"]
+    """Inverse covariance of an observed particle's position [1/m^2]."""
     about: Bool[Array, " n"]
-    """Particles whose s is worth knowing."""
+    """Particles whose s is asked about."""
     mixture: Mixture
-    """The belief's, of each particle's s."""
-    known: Float[Array, " n"]
-    """Variance that the belief's Gaussian leaves of each s."""
+    """Marginal of each particle's s under the belief."""
+    variance: Float[Array, " n"]
+    """Variance of each s under the belief's Gaussian."""
 
     @classmethod
     def build(
         cls,
         balance: ForceBalance,
         belief: AttachmentBelief,
-        precision: Float[Array, "3 3"],
+        point_precision: Float[Array, "3 3"],
         about: Bool[Array, " n"],
     ) -> "PullPredictor":
-        """With what does not depend on the pull worked out once."""
-        mixture, gaussian = _believed(belief)
+        """Return a predictor, with what does not depend on the pull computed once.
+
+        Args:
+            balance: the sheet's force balance.
+            belief: about the attachments.
+            point_precision: inverse covariance of an observed particle's position [1/m^2].
+            about: particles whose s is asked about.
+        """
+        mixture, gaussian = _mixture_and_gaussian(belief)
         return cls(
             balance=balance,
             belief=belief,
-            precision=precision,
+            point_precision=point_precision,
             about=about,
             mixture=mixture,
-            known=gaussian.variance,
+            variance=gaussian.variance,
         )
 
     @classmethod
@@ -104,97 +140,113 @@ class PullPredictor(eqx.Module):
         return cls.build(balance, belief, jnp.asarray(estimator.point_precision), asked)
 
     def scenarios(self, key: PRNGKeyArray, count: int, *, unknown: float | Array) -> Float[Array, "count n"]:
-        """Draws of s: free, or on which rung, for each particle by itself, then all s together given that.
+        """Draw scenarios of s: first each particle's stiffness component by itself, then all s jointly given those.
 
-        None is stiffer than `unknown` [N/m], unless it is as likely above as below more.
+        Args:
+            key: of the draws.
+            count: number of scenarios.
+            unknown: largest stiffness [N/m] of a particle, unless its median is above.
         """
         belief, mixture = self.belief, self.mixture
         weight = mixture.weight
-        most = jnp.maximum(belief.bounded(jnp.asarray(unknown)[None]), mixture.quantile(0.5))
+        largest = jnp.maximum(belief.bounded(jnp.asarray(unknown)[None]), mixture.quantile(0.5))
         prior = belief.prior.stiffness
         by_state, by_noise = jax.random.split(key)
-        log_weight = jnp.log(jnp.maximum(weight, 1e-300))[None]
+        log_weight = jnp.log(jnp.maximum(weight, MIN_WEIGHT))[None]
         states = jax.random.categorical(by_state, log_weight, axis=1, shape=(count, weight.shape[1]))
         noise = jax.random.normal(by_noise, states.shape)
 
-        def one(state: Int[Array, " n"], noise: Float[Array, " n"]) -> Float[Array, " n"]:
+        def draw(state: Int[Array, " n"], noise: Float[Array, " n"]) -> Float[Array, " n"]:
             precision = prior.sd[state] ** -2
             factor = jnp.linalg.cholesky(belief.precision + jnp.diag(precision))
             mean = jax.scipy.linalg.cho_solve((factor, True), belief.shift + prior.mean[state] * precision)
             s = mean + jax.scipy.linalg.solve_triangular(factor.T, noise, lower=False)
-            return jnp.where(state > 0, jnp.clip(s, 0, most), 0.0)
+            return jnp.where(state > 0, jnp.clip(s, 0, largest), 0.0)
 
-        return jax.lax.map(lambda drawn: one(*drawn), (states, noise))
+        return jax.lax.map(lambda drawn: draw(*drawn), (states, noise))
 
     def gain(self, precision: Float[Array, "n n"]) -> Float[Array, ""]:
-        """Expected fall of the entropy of what is asked about, by evidence about s of that precision [nat]."""
+        """Return the expected fall of the entropy of the s asked about, by evidence of that precision [nat]."""
         before = self.belief.precision + jnp.diag(self.belief.site_precision)
-        better = jnp.sum(lower_inverse(jnp.linalg.cholesky(before + precision)) ** 2, axis=0)
-        noise = 1 / jnp.maximum(1 / better - 1 / self.known, FAINT)
+        variance = jnp.sum(lower_inverse(jnp.linalg.cholesky(before + precision)) ** 2, axis=0)
+        noise = 1 / jnp.maximum(1 / variance - 1 / self.variance, MIN_PRECISION)
         return jnp.sum(jnp.where(self.about, expected_fall(self.mixture, noise), 0.0))
 
     def outcome(self, candidate: CandidatePull, s: Float[Array, " n"], *, informative: bool = True) -> Outcome:
-        """Of a tug in a scenario; the gain costs as much as the rest, and is 0 where it is not asked for.
+        """Return the outcome of one pull in one scenario.
 
-        Two programs, so that what is the same with and without the gain is compiled once.
+        It is two programs, so that what is the same with and without the gain is compiled once.
+
+        Args:
+            candidate: one pull.
+            s: one scenario.
+            informative: whether to compute the gain, which costs as much as the rest; if not, it is 0.
         """
-        found = self.ending(candidate, s)
-        return eqx.tree_at(lambda one: one.gain, found, self.shown(candidate, s, found.x)) if informative else found
+        found = self.equilibrium(candidate, s)
+        if not informative:
+            return found
+        return eqx.tree_at(lambda outcome: outcome.gain, found, self.gain_at(candidate, s, found.x))
 
     @eqx.filter_jit
-    def ending(self, candidate: CandidatePull, s: Float[Array, " n"]) -> Outcome:
-        """Where a tug ends in a scenario and what it asks of the attachments; nothing is said of the gain."""
+    def equilibrium(self, candidate: CandidatePull, s: Float[Array, " n"]) -> Outcome:
+        """Return where a pull ends in a scenario and how it loads the attachments, with a gain of 0."""
         balance = self.balance
         x = balance.predict(
-            jnp.where(candidate.held[:, None], candidate.to, candidate.start), s, self._seen(candidate, candidate.to)
+            jnp.where(candidate.held[:, None], candidate.to, candidate.start),
+            s,
+            self._evidence(candidate, candidate.to),
         )
         b, squared = balance.reference * s / (1 - s), jnp.sum((x - balance.energy.rest) ** 2, axis=1)
         force = jnp.max(b * jnp.sqrt(squared))
         return Outcome(x=x, gain=jnp.zeros(()), energy=0.5 * b @ squared / len(s), force=force)
 
     @eqx.filter_jit
-    def shown(self, candidate: CandidatePull, s: Float[Array, " n"], x: Float[Array, "n 3"]) -> Float[Array, ""]:
-        """Gain by a look at where a tug ends in a scenario [nat]."""
-        frame = self.balance.linearise(x, s, self._seen(candidate, x))
+    def gain_at(self, candidate: CandidatePull, s: Float[Array, " n"], x: Float[Array, "n 3"]) -> Float[Array, ""]:
+        """Return the gain by observing the equilibrium x of a pull in a scenario [nat]."""
+        frame = self.balance.linearise(x, s, self._evidence(candidate, x))
         return self.gain(self.balance.information(frame, self.balance.fit(frame)).precision)
 
-    def _seen(self, candidate: CandidatePull, y: Float[Array, "n 3"]) -> Evidence:
-        precision = jnp.broadcast_to(self.precision[None], (len(y), 3, 3))
+    def _evidence(self, candidate: CandidatePull, y: Float[Array, "n 3"]) -> Evidence:
+        """Return the evidence of a frame in which all particles are observed at y."""
+        precision = jnp.broadcast_to(self.point_precision[None], (len(y), 3, 3))
         return Evidence(y=y, precision=precision, held=candidate.held, force_unknown=candidate.force_unknown)
 
 
 @eqx.filter_jit
-def _believed(belief: AttachmentBelief) -> tuple[Mixture, Gaussian]:
+def _mixture_and_gaussian(belief: AttachmentBelief) -> tuple[Mixture, Gaussian]:
     return belief.mixture(), belief.gaussian()
 
 
 def expected_fall(mixture: Mixture, noise: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Of 1/2 ln of each variable's variance, by one measurement with noise of the given variance.
+    """Return the expected fall of 1/2 ln of each variable's variance by one noisy measurement of it [nat].
 
-    The normals of the mixture are not cut off to [0, 1]; each is integrated over by Gauss-Hermite quadrature.
+    The normals of the mixture are not truncated to [0, 1]. Each is integrated over by Gauss-Hermite quadrature.
+
+    Args:
+        mixture: of normals, for each variable.
+        noise: variance of the measurement of each variable.
     """
-    weight, mean, width = mixture.weight, mixture.mean, mixture.sd**2
-    node, share = (jnp.asarray(part) for part in np.polynomial.hermite_e.hermegauss(NODES))
-    total = width + noise[None]
-    log_weight = jnp.log(jnp.maximum(weight, 1e-300)) - 0.5 * jnp.log(total)
+    weight, mean, variance = mixture.weight, mixture.mean, mixture.sd**2
+    node, node_weight = (jnp.asarray(part) for part in np.polynomial.hermite_e.hermegauss(QUADRATURE_NODES))
+    total = variance + noise[None]
+    log_weight = jnp.log(jnp.maximum(weight, MIN_WEIGHT)) - 0.5 * jnp.log(total)
 
-    def after(read: Float[Array, " n"]) -> Float[Array, " n"]:
-        """1/2 ln of the variance left when that is read."""
-        told = jax.nn.softmax(log_weight - 0.5 * (read[None] - mean) ** 2 / total, axis=0)
-        return 0.5 * jnp.log(_variance(told, mean + width / total * (read[None] - mean), width * noise[None] / total))
+    def after(measured: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return 1/2 ln of the posterior variance for a measured value."""
+        posterior = jax.nn.softmax(log_weight - 0.5 * (measured[None] - mean) ** 2 / total, axis=0)
+        posterior_mean = mean + variance / total * (measured[None] - mean)
+        return 0.5 * jnp.log(_variance(posterior, posterior_mean, variance * noise[None] / total))
 
-    reads = mean[None] + jnp.sqrt(total)[None] * node[:, None, None]
-    left = jax.vmap(jax.vmap(after))(reads)
-    expected = jnp.einsum("q,cn,qcn->n", share / jnp.sum(share), weight, left)
-    return 0.5 * jnp.log(_variance(weight, mean, width)) - expected
-
-
-def _variance(weight: Float[Array, "c n"], mean: Float[Array, "c n"], width: Float[Array, "c n"]) -> Float[Array, " n"]:
-    middle = jnp.sum(weight * mean, axis=0)
-    return jnp.sum(weight * (width + (mean - middle[None]) ** 2), axis=0)
+    measured = mean[None] + jnp.sqrt(total)[None] * node[:, None, None]
+    expected = jnp.einsum(
+        "q,cn,qcn->n", node_weight / jnp.sum(node_weight), weight, jax.vmap(jax.vmap(after))(measured)
+    )
+    return 0.5 * jnp.log(_variance(weight, mean, variance)) - expected
 
 
-NODES = 5
-"""Of the quadrature over each normal of a mixture."""
-FAINT = 1e-6
-"""Least precision of a measurement."""
+def _variance(
+    weight: Float[Array, "c n"], mean: Float[Array, "c n"], variance: Float[Array, "c n"]
+) -> Float[Array, " n"]:
+    """Return the variance of a mixture of c normals, for each of n variables."""
+    mixture_mean = jnp.sum(weight * mean, axis=0)
+    return jnp.sum(weight * (variance + (mean - mixture_mean[None]) ** 2), axis=0)

@@ -1,6 +1,6 @@
-"""A tool's kinematics through MJX, from its own MJCF alone: how far it is above the bed, wherever its tip is taken.
+"""A tool's kinematics through MJX, from its MJCF alone: how high it is above the bed for any position of its tip.
 
-The only place in the estimator that imports MuJoCo, and only once a tool is read: everything else runs without it.
+This is the only file of the estimator that imports MuJoCo, and only once a tool is read. All else runs without it.
 """
 
 import contextlib
@@ -17,31 +17,32 @@ from jiggle_mj.errors import OptionError
 
 
 class ToolKinematics(eqx.Module):
-    """A tool whose frame has its origin at the tip, and jaws on hinges that are closed at 0."""
+    """Tool whose frame has its origin at the tip, and whose jaws are on hinges that are closed at 0."""
 
     model: Any
-    """MJX's."""
+    """MJX model."""
     data: Any
+    """MJX data, of which only the poses are used."""
     openings: Float[Array, "openings joints"]
-    """Angles of the jaws, closed and as far open as they go [rad]."""
+    """Angles of the jaws, closed and at the upper limit of their range [rad]."""
 
     @classmethod
     def read(cls, mjcf: str) -> "ToolKinematics":
-        """Compile a tool.
+        """Return a compiled tool.
 
         Args:
             mjcf: the XML; one mocap body, whose origin is the tip, made of spheres and capsules.
 
         Raises:
-            OptionError: it is no such tool.
+            OptionError: the XML does not compile, or is not such a tool.
         """
         mujoco, mjx = _mjx()
         try:
             model = mujoco.MjModel.from_xml_string(mjcf)
         except ValueError as failure:
             raise OptionError(f"the tool's MJCF does not compile: {failure}") from failure
-        round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
-        if not (model.nmocap == 1 and model.ngeom and np.isin(model.geom_type, round_ones).all()):
+        rounded = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+        if not (model.nmocap == 1 and model.ngeom and np.isin(model.geom_type, rounded).all()):
             raise OptionError(
                 "the tool must be one mocap body, its origin at the tip, of spheres and capsules alone; "
                 f"got {model.nmocap} mocap bodies, and geoms of types {sorted(set(model.geom_type.tolist()))}."
@@ -53,12 +54,12 @@ class ToolKinematics(eqx.Module):
             return cls(model=mjx.put_model(model), data=mjx.make_data(model), openings=openings)
 
     def clearance(self, tip: Float[Array, " 3"], quat_wxyz: Float[Array, " 4"]) -> Float[Array, ""]:
-        """Height of the tool's lowest point, with the jaws closed or open, whichever is lower [m].
+        """Return the height of the tool's lowest point, with closed or open jaws, whichever is lower [m].
 
-        MJX gives a mocap body its pose after its children had theirs, so the pose is set as the body's own.
+        MJX sets the pose of a mocap body after those of its children. So the pose is set as the body's own.
 
         Args:
-            tip: where the tip is [m].
+            tip: position of the tip [m].
             quat_wxyz: orientation of the tool.
         """
         _, mjx = _mjx()
@@ -79,12 +80,12 @@ class ToolKinematics(eqx.Module):
 
 @eqx.filter_jit
 def clearances(tweezer: ToolKinematics, tips: Float[Array, "k 3"], quat_wxyz: Float[Array, " 4"]) -> Float[Array, " k"]:
-    """See `ToolKinematics.clearance`; of many tips at once [m]."""
+    """Return the clearance of the tool for many tips [m]; see `ToolKinematics.clearance`."""
     return jax.vmap(lambda tip: tweezer.clearance(tip, quat_wxyz))(tips)
 
 
 def _mjx() -> tuple[Any, Any]:
-    """Imported here, as it takes seconds and says on stdout which of its other engines are missing."""
+    """Return the modules. The import takes seconds, and prints to stdout which of its other engines are missing."""
     with contextlib.redirect_stdout(io.StringIO()):
         import mujoco
         from mujoco import mjx

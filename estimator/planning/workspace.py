@@ -1,4 +1,4 @@
-"""Where the tip may be: within reach, and nowhere where any part of the tool would touch the bed."""
+"""Workspace of the tip: within reach, and with all of the tool above the bed."""
 
 from dataclasses import dataclass
 
@@ -15,20 +15,26 @@ from .tool_kinematics import ToolKinematics, clearances
 
 @dataclass(frozen=True, kw_only=True)
 class Workspace:
-    """Of one sheet and one tool."""
+    """Workspace of one tool over one sheet."""
 
     low: Float[np.ndarray, " 3"]
     """Lower corner of the tip's reach, at the resting sheet [m]."""
     high: Float[np.ndarray, " 3"]
     """Upper corner [m]."""
     bed: float
-    """Height of the bed, on which the sheet rests with half its thickness [m]."""
+    """Height of the bed, half a thickness below the resting sheet's middle surface [m]."""
     tweezer: ToolKinematics | None
-    """If None, nothing but the tip is known of the tool."""
+    """The tool; if None, only the tip is kept within reach."""
 
     @classmethod
     def around(cls, estimator: Estimator, limits: Limits, tweezer: ToolKinematics | None = None) -> "Workspace":
-        """The resting sheet, and the limits beside and above it."""
+        """Return the workspace around the resting sheet, extended by the limits beside and above it.
+
+        Args:
+            estimator: after its sheet is known.
+            limits: say how far the tip may go beside and above the sheet.
+            tweezer: the tool; None if only the tip is known.
+        """
         rest = estimator.sheet.rest
         bottom, top = rest.min(axis=0), rest.max(axis=0)
         beside = np.array([limits.beside, limits.beside, 0.0])
@@ -37,7 +43,7 @@ class Workspace:
         return cls(low=bottom - beside, high=high, bed=bed, tweezer=tweezer)
 
     def reached(self, tips: Float[np.ndarray, "k 3"], tool: ToolState) -> Bool[np.ndarray, " k"]:
-        """Which tips are within reach and leave the tool, turned as it is now, clear of the bed."""
+        """Return which tips [m] are within reach, with the tool in its current orientation clear of the bed."""
         inside: Bool[np.ndarray, " k"] = np.all((self.low <= tips) & (tips <= self.high), axis=1)
         if self.tweezer is None:
             return inside

@@ -36,8 +36,8 @@ def story(found: Mapping[str, Any]) -> list[str]:
         told.append(f"Added: {one['name']} ({sizes}), log Bayes factor {one['log_bayes_factor']:.0f}.")
         if one["this_session_alone"]:
             told.append(f"{one['name']} is of the tool, camera or tracker, and holds for this session alone.")
-        if one["not_told_from"]:
-            told.append(f"Instead of {one['name']} it may as well be: {', '.join(one['not_told_from'])}.")
+        if one["indistinguishable_from"]:
+            told.append(f"Instead of {one['name']} it may as well be: {', '.join(one['indistinguishable_from'])}.")
     told += [f"Refused: {one['name']}, since {one['why']}." for one in found["refused"]]
     held = found["held_out"]
     if held["folds"] and found["effects"]:
@@ -133,7 +133,9 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
     flat = plane_of(sheet.rest).flatten(sheet.rest)
     misses = {
         when: 1e3
-        * np.array([np.nan if one is None else np.linalg.norm(one) for one in found[key]["particles"]["mean_off_m"]])
+        * np.array(
+            [np.nan if one is None else np.linalg.norm(one) for one in found[key]["particles"]["mean_residual_m"]]
+        )
         for when, key in zip(TIMES, LOCALISED, strict=True)
     }
     most = float(np.nanmax([np.nanmax(miss) for miss in misses.values()]))
@@ -149,7 +151,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
                   marker={"color": BEFORE}, showlegend=False)  # fmt: skip
     figure.add_trace(bars, row=2, col=1)
     for when, key, colour in zip(TIMES, LOCALISED, (BEFORE, AFTER), strict=True):
-        goes = {name: value for name, value in found[key]["goes_with"].items() if value is not None}
+        goes = {name: value for name, value in found[key]["correlates_with"].items() if value is not None}
         figure.add_trace(
             go.Bar(x=[*goes.values()], y=[*goes], orientation="h", marker={"color": colour}, name=when), row=2, col=2
         )

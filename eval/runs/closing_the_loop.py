@@ -89,7 +89,7 @@ def close_loop(
         if true.identity != recording.metadata.get("identity", ""):
             raise RecordingError(f"{truth} is not the truth of {recording_path}.")
         last = dataset.frames[-1].index
-        for when, fitted in (("before", closed.stages[0].fitted), ("after", closed.final)):
+        for when, fitted in (("before", closed.contexts[0].fitted), ("after", closed.final)):
             found[f"detection_{when}"] = _scored(sheet, fitted.attached, true, last)
         keep()
     if suggestion:

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from jiggle_mj.actions import Action, Cut, Suture, Wait
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.physics.mesh import SheetMesh
-from jiggle_mj.estimator.planning.procedures import ROOM, free_stretch, tour
+from jiggle_mj.estimator.planning.procedures import CUT_WIDTH, free_stretch, tour
 from jiggle_mj.recording.declaration import is_current, made_by
 from jiggle_mj.scenes import Reference, load_scene
 from jiggle_mj.scenes.scene.programme import grasp_points, programme
@@ -106,7 +106,7 @@ def _acts(scene: Scene, estimator: Estimator, rng: np.random.Generator) -> Itera
     flat, found, plan = mesh.rest[:, :2], np.flatnonzero(detection.attached), scene.procedure
     for middle in rng.choice(found, size=min(PLACES, len(found)), replace=False):
         near = np.argsort(np.linalg.norm(flat[found] - flat[middle], axis=1))[:CUT]
-        yield Cut(path=tour(flat[found[near]]), width=ROOM * mesh.spacing)
+        yield Cut(path=tour(flat[found[near]]), width=CUT_WIDTH * mesh.spacing)
     for angle in rng.uniform(0, 2 * np.pi) + 2 * np.pi / PLACES * np.arange(PLACES):
         beyond = flat @ np.array([np.cos(angle), np.sin(angle)]) < 0
         free = np.where(beyond, 1.0, detection.score)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.config import EstimatorConfig
 from jiggle_mj.estimator.filters.build import build_filter
-from jiggle_mj.estimator.planning.information_policy import EXPECTED, JUDGED, LIKELY, PULLS
+from jiggle_mj.estimator.planning.information_config import InformationPolicyConfig
 from jiggle_mj.estimator.planning.outcomes import outcomes
 from jiggle_mj.estimator.planning.pull_predictor import CandidatePull, PullPredictor
 
@@ -50,20 +50,24 @@ def our_plan(one: Case) -> Callable[[], object]:
     predictor = PullPredictor.build(filter.balance(state), belief, jnp.eye(3) / NOISE**2, everywhere)
     pull, held = one.frames[-1].pull, one.frames[-1].held
     assert pull is not None
-    ends = pull.before[None] + jnp.asarray(PULLS)[:, None]
-    many = (len(PULLS), *held.shape)
+    config = InformationPolicyConfig()
+    ends = pull.before[None] + jnp.asarray(config.pulls)[:, None]
+    many = (len(ends), *held.shape)
     candidates = CandidatePull(
         start=jnp.broadcast_to(pull.before[None], ends.shape),
         held=jnp.broadcast_to(held[None], many),
         force_unknown=jnp.broadcast_to(held[None], many),
         to=ends,
     )
-    likely, step = (jax.tree.map(lambda leaf, count=count: leaf[:count], candidates) for count in (LIKELY, 1))
+    likely, step = (
+        jax.tree.map(lambda leaf, count=count: leaf[:count], candidates) for count in (config.n_refined_pulls, 1)
+    )
     here = eqx.tree_at(lambda candidate: candidate.to, step, step.start)
     s = belief.bounded(one.b)
 
     def plan() -> object:
-        first, more, refined = (jnp.broadcast_to(s[None], (count, len(s))) for count in (1, EXPECTED - 1, JUDGED))
+        counts = 1, config.n_gain_scenarios - 1, config.n_safety_scenarios
+        first, more, refined = (jnp.broadcast_to(s[None], (count, len(s))) for count in counts)
         told = outcomes(predictor, candidates, first), outcomes(predictor, likely, more)
         return told, [outcomes(predictor, candidate, refined, informative=False) for candidate in (here, step)]
 

@@ -1,96 +1,111 @@
-"""Effects against each other and against none, by numbers made up for it."""
+"""Comparison of effects with each other and with none, by made-up numbers."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from jiggle_mj.estimator.attribution import search
-from jiggle_mj.estimator.attribution.comparison import against, behind, best, not_told_from, outdone
+from jiggle_mj.estimator.attribution.comparison import against, behind, best, indistinguishable, outdone
 from jiggle_mj.estimator.attribution.held_out import HeldOut
 from jiggle_mj.estimator.attribution.hypotheses import FitContext, Hypothesis, reported_sd
-from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.scores import Score
 from jiggle_mj.estimator.attribution.unexplained_residual import UnexplainedResidual
 from jiggle_mj.estimator.effects import LIBRARY
+from tests.support.small_fit import small_fit, small_problem
 
-EFFECTS = {one.name: one for one in LIBRARY}
+EFFECTS = {effect.name: effect for effect in LIBRARY}
+
+
+def ignore(message: str) -> None:
+    """Drop a progress message."""
 
 
 def held_out(*errors_mm: float) -> list[HeldOut]:
-    """Parts that are each missed by so much."""
-    return [HeldOut(off=np.array([[1e-3 * one, 0.0, 0.0]]), reckon=lambda: np.ones((1, 3))) for one in errors_mm]
+    """Return the predictions of parts with the given errors."""
+    return [
+        HeldOut(residual=np.array([[1e-3 * error, 0.0, 0.0]]), compute_sd=lambda: np.ones((1, 3)))
+        for error in errors_mm
+    ]
 
 
-def leaving(gain: float) -> UnexplainedResidual:
+def unexplained(gain: float) -> UnexplainedResidual:
+    """Return an unexplained residual of a given gain [nat]."""
     return UnexplainedResidual(gain=gain, variance=1.0, amplitude=1.0, tool_variance=1.0)
 
 
-def hypothesis(name: str, gain: float, *errors_mm: float, left: float = 0.0, theta: float = 0.01) -> Hypothesis:
-    """An effect of so much evidence, with nothing else of a fit than its first parameter."""
-    effect, one = EFFECTS[name], object.__new__(Hypothesis)
-    point = SimpleNamespace(theta=np.full(len(effect.prior_sd), theta * np.asarray(effect.prior_sd)))
-    vars(one).update(
+def hypothesis(name: str, gain: float, *errors_mm: float, left: float = 0.0, size: float = 0.01) -> Hypothesis:
+    """Return an effect with a log Bayes factor [nat], held-out errors, unexplained gain [nat] and size [prior sds]."""
+    effect = EFFECTS[name]
+    theta = size * np.asarray(effect.prior_sd)
+    score = Score(name=name, log_bayes_factor=gain, site=0, theta=theta, p_value=0.0, kept=1.0)
+    return Hypothesis(
+        score=score,
         effect=effect,
-        fitted=SimpleNamespace(point=point),
-        at=np.arange(len(effect.prior_sd)),
+        fitted=small_fit(theta=theta),
         log_bayes_factor=gain,
-        left=leaving(left),
+        at=np.arange(len(theta)),
+        sds=np.zeros(len(theta)),
+        unexplained=unexplained(left),
         folds=held_out(*errors_mm),
     )
-    return one
 
 
 def context(*errors_mm: float, left: float = 0.0) -> FitContext:
-    one = object.__new__(FitContext)
-    vars(one).update(folds=held_out(*errors_mm), left=leaving(left))
-    return one
+    """Return a fit with given held-out errors and an unexplained gain [nat]."""
+    return FitContext(fitted=small_fit(), unexplained=unexplained(left), folds=held_out(*errors_mm), scores=[])
 
 
-def test_the_best_explains_much_and_foretells_well():
+def names(hypotheses: list[Hypothesis]) -> list[str]:
+    """Return the names of the hypotheses' effects."""
+    return [one.effect.name for one in hypotheses]
+
+
+def test_the_best_explains_much_and_predicts_well():
     likely, sharp, blunt = (
         hypothesis("gravity", 300.0, 0.54, 0.54),
         hypothesis("stretch", 200.0, 0.4, 0.4),
         hypothesis("bed", 320.0, 0.9, 0.9),
     )
     assert best([blunt, likely, sharp]) is likely
-    assert "foretells better, to 0.54 mm against 0.90" in behind(blunt, likely)
+    assert "predicts held-out parts better, to 0.54 mm against 0.90 mm" in behind(blunt, likely)
     assert behind(sharp, likely) == "gravity is likelier by 100 nat"
 
 
-def test_without_parts_left_out_the_likeliest_is_the_best():
+def test_without_held_out_parts_the_likeliest_is_the_best():
     likely, less = hypothesis("gravity", 300.0), hypothesis("stretch", 200.0)
     assert best([less, likely]) is likely
     assert behind(less, likely) == "gravity is likelier by 100 nat"
 
 
 @pytest.mark.parametrize(
-    ("name", "gain", "error", "told"),
+    ("name", "gain", "error", "distinguishable"),
     [
         ("friction", 290.0, 0.5, False),  # as likely, as good
         ("friction", 200.0, 0.5, True),  # less likely
         ("friction", 290.0, 0.6, False),
-        ("friction", 290.0, 0.65, True),  # foretells worse
-        ("stretch", 100.0, 0.8, False),  # often confused: less is enough
+        ("friction", 290.0, 0.65, True),  # predicts worse
+        ("stretch", 100.0, 0.8, False),  # often confused: less is required
         ("stretch", 100.0, 0.9, True),
-        ("friction", 310.0, 0.8, False),  # explains more where it foretells worse
+        ("friction", 310.0, 0.8, False),  # explains more and predicts worse
         ("heterogeneity", 290.0, 0.5, True),  # has more parameters and explains less
         ("heterogeneity", 298.0, 0.5, False),
     ],
 )
-def test_what_cannot_be_told_from_the_best(name, gain, error, told):
+def test_which_effects_are_indistinguishable_from_the_best(name, gain, error, distinguishable):
     first = hypothesis("gravity", 300.0, 0.5, 0.5)
-    assert not_told_from(hypothesis(name, gain, error, error), first) is not told
+    assert indistinguishable(hypothesis(name, gain, error, error), first) is not distinguishable
 
 
 @pytest.mark.parametrize(
     ("one", "why"),
     [
         (hypothesis("gravity", 300.0, 0.5, 0.5, 0.5, 0.5), None),
-        (hypothesis("gravity", 300.0, 0.5, 0.5, 1.01, 1.01), None),  # half of them is enough
+        (hypothesis("gravity", 300.0, 0.5, 0.5, 1.01, 1.01), None),  # better in half of them
         (hypothesis("gravity", 300.0, 0.5, 1.01, 1.01, 1.01), "better in 1 of 4"),
         (
             hypothesis("gravity", 25.0, 0.9, 0.9, 0.9, 0.9, left=10.0),
-            "25 nat, less than the 30 from which one is added",
+            "its log Bayes factor is 25 nat, below 30 nat",
         ),
         (hypothesis("gravity", 45.0, 0.98, 0.98, 0.98, 0.98, left=15.0), None),  # certain, and leaves little
         (hypothesis("gravity", 45.0, 0.98, 0.98, 0.98, 0.98, left=25.0), "0.98 mm with it and 1.00 mm without"),
@@ -98,43 +113,46 @@ def test_what_cannot_be_told_from_the_best(name, gain, error, told):
         (hypothesis("gravity", 45.0, 1.5, 1.05, 0.99, 0.99), "1.15 mm with it and 1.00 mm without, better in 2 of 4"),
         (hypothesis("gravity", 45.0, 1.5, 1.01, 0.99, 0.99, left=25.0), "1.14 mm with it and 1.00 mm without"),
         (hypothesis("gravity", 45.0, 1.01, 1.01, 1.01, 0.5), "0.91 mm with it and 1.00 mm without, better in 1 of 4"),
-        (hypothesis("gravity", 35.0, 0.9, 0.9, 0.9, 0.9, left=-10.0), "larger errors without a cause explain"),
-        (hypothesis("gravity", 15.0, 0.7, 0.7, 0.7, 0.7), None),  # foretelling decides
-        (hypothesis("gravity", 300.0, 0.5, 0.5, 0.5, 0.5, theta=4.0), "beyond 3.5 prior standard deviations"),
+        (hypothesis("gravity", 35.0, 0.9, 0.9, 0.9, 0.9, left=-10.0), "larger errors without a named cause explain"),
+        (hypothesis("gravity", 15.0, 0.7, 0.7, 0.7, 0.7), None),  # held-out predictions decide
+        (hypothesis("gravity", 300.0, 0.5, 0.5, 0.5, 0.5, size=4.0), "beyond 3.5 prior standard deviations"),
     ],
 )
-def test_what_is_not_added_and_why(one, why):
-    said = against(one, context(1.0, 1.0, 1.0, 1.0, left=20.0))
-    assert said is None if why is None else why in (said or "")
+def test_which_effects_are_not_added_and_why(one, why):
+    reason = against(one, context(1.0, 1.0, 1.0, 1.0, left=20.0))
+    assert reason is None if why is None else why in (reason or "")
 
 
 @pytest.mark.parametrize(("gain", "added"), [(230.0, True), (220.0, False)])
-def test_what_is_far_less_likely_than_one_that_is_refused_is_not_added_in_its_place(gain, added):
-    absurd = hypothesis("bed", 900.0, 0.5, theta=4.0)
-    said = outdone(
-        hypothesis("stretch", gain, 0.5), [absurd, hypothesis("friction", 20.0, 1.0), hypothesis("gravity", 300.0, 1.0)]
+def test_an_effect_far_less_likely_than_a_refused_one_is_not_added_in_its_place(gain, added):
+    implausible = hypothesis("bed", 900.0, 0.5, size=4.0)
+    reason = outdone(
+        hypothesis("stretch", gain, 0.5),
+        [implausible, hypothesis("friction", 20.0, 1.0), hypothesis("gravity", 300.0, 1.0)],
     )
-    assert said is None if added else said == "gravity is likelier by 80 nat, and refused itself"
+    assert reason is None if added else reason == "gravity is likelier by 80 nat, and was refused itself"
 
 
-def test_what_accounts_for_all_that_was_left_over_need_only_foretell_no_worse():
+def test_an_effect_that_accounts_for_the_whole_unexplained_residual_need_only_predict_no_worse():
     before = context(1.0, 1.0, left=100.0)
     assert against(hypothesis("gravity", 300.0, 0.99, 0.99, left=40.0), before) is None
     assert against(hypothesis("gravity", 300.0, 0.99, 0.99, left=80.0), before) is not None
     assert against(hypothesis("gravity", 300.0, 1.01, 1.01, left=40.0), before) is not None
 
 
-def test_of_two_parts_none_is_put_aside():
+def test_of_two_parts_none_is_set_aside():
     assert against(hypothesis("gravity", 45.0, 1.5, 0.99), context(1.0, 1.0, left=20.0)) is not None
 
 
-def test_what_another_explains_makes_none_likely():
+def test_a_head_start_does_not_make_a_weak_effect_likely():
     weak = hypothesis("tool_scale", 15.0, 0.9, 0.9, 0.9, 0.9)
-    assert "it explains 15 nat" in (against(weak, context(1.0, 1.0, 1.0, 1.0, left=20.0), head_start=300.0) or "")
+    assert "its log Bayes factor is 15 nat" in (
+        against(weak, context(1.0, 1.0, 1.0, 1.0, left=20.0), head_start=300.0) or ""
+    )
 
 
 @pytest.mark.parametrize(("first_mm", "passed"), [(1.1, []), (0.9, ["gravity", "stretch"])])
-def test_until_one_is_better_none_is_added_in_place_of_a_far_likelier_one(monkeypatch, first_mm, passed):
+def test_until_one_improves_none_is_added_in_place_of_a_far_likelier_one(monkeypatch, first_mm, passed):
     hypotheses = [
         hypothesis("gravity", 90.0, first_mm),
         hypothesis("friction", 85.0, 1.1),
@@ -143,14 +161,14 @@ def test_until_one_is_better_none_is_added_in_place_of_a_far_likelier_one(monkey
     monkeypatch.setattr(search, "fitted_hypotheses", lambda *_: hypotheses)
     monkeypatch.setattr(search, "refined", lambda problem, one, used, log: one)
     before = context(1.0, left=20.0)
-    found, refused = search._tried(object.__new__(Problem), before, [(before, 0.0)], [], set(), lambda said: None)
-    assert [one.effect.name for one in found] == passed
+    found, refused = search.tested_hypotheses(small_problem(), before, [(before, 0.0)], [], set(), ignore)
+    assert names(found) == passed
     assert refused[-1][0].effect.name == ("friction" if passed else "stretch")
     assert passed or "gravity is likelier by 30 nat" in refused[-1][1]
 
 
-def test_each_but_the_last_is_compared_again_with_what_was_tried_in_its_place(monkeypatch):
-    """The first is exchanged for what does better beside the others, the second stays, and the order with them."""
+def test_each_but_the_last_is_compared_again_with_its_alternatives(monkeypatch):
+    """The first is replaced by a better alternative, the second stays, and the order stays."""
     first, second, third = (hypothesis(name, 300.0, 0.5) for name in ("gravity", "tool_scale", "friction"))
     rival, unlikely = hypothesis("stretch", 250.0, 0.5), hypothesis("bed", 100.0, 0.5)
     added = [
@@ -160,28 +178,22 @@ def test_each_but_the_last_is_compared_again_with_what_was_tried_in_its_place(mo
         search.AddedHypothesis(hypothesis=second, rivals=[], others=[]),
         search.AddedHypothesis(hypothesis=third, rivals=[], others=[]),
     ]
-    asked = []
+    compared = []
 
     def beside(problem, last, one, others, used, log):
-        asked.append([one.effect.name, *(other.effect.name for other in others)])
+        compared.append(names([one, *others]))
         gains = {"gravity": 100.0, "stretch": 280.0, "tool_scale": 300.0}
-        return None, [hypothesis(other.effect.name, gains[other.effect.name], 0.5) for other in (one, *others)]
+        return small_fit(), [hypothesis(other.effect.name, gains[other.effect.name], 0.5) for other in (one, *others)]
 
-    monkeypatch.setattr(search, "_beside", beside)
-    monkeypatch.setattr(search, "_with", lambda one, last: one)
-    monkeypatch.setattr(
-        search,
-        "replace",
-        lambda one, hypothesis: search.AddedHypothesis(hypothesis=hypothesis, rivals=one.rivals, others=[]),
-    )
-    found = search.revised(object.__new__(Problem), added, set(), lambda said: None)
-    assert asked == [["gravity", "stretch"], ["tool_scale"]]
-    assert [one.hypothesis.effect.name for one in found] == ["stretch", "tool_scale", "friction"]
-    assert [one.effect.name for one in found[0].rivals] == ["gravity"]
+    monkeypatch.setattr(search, "alternatives_beside", beside)
+    found = search.revised(small_problem(), added, set(), ignore)
+    assert compared == [["gravity", "stretch"], ["tool_scale"]]
+    assert names([one.hypothesis for one in found]) == ["stretch", "tool_scale", "friction"]
+    assert names(found[0].rivals) == ["gravity"]
 
 
-def test_what_was_not_told_from_an_effect_that_is_dropped_is_still_not_told_from_it(monkeypatch):
-    """And what was far less likely than that one was only beside it as good as the one that stays."""
+def test_a_rival_stays_one_after_the_effect_it_was_a_rival_of_is_dropped(monkeypatch):
+    """An alternative far less likely than the dropped effect was a rival only with that effect in the model."""
     first, second, third = (hypothesis(name, 300.0, 0.5) for name in ("gravity", "stretch", "friction"))
     rivals, bending = (
         [hypothesis("bending", 250.0, 0.5), hypothesis("bed", 250.0, 0.5)],
@@ -189,35 +201,34 @@ def test_what_was_not_told_from_an_effect_that_is_dropped_is_still_not_told_from
     )
     added = [
         search.AddedHypothesis(
-            hypothesis=first, rivals=[hypothesis("stretch", 250.0, 0.5)], others=[(bending, "foretells worse")]
+            hypothesis=first, rivals=[hypothesis("stretch", 250.0, 0.5)], others=[(bending, "predicts worse")]
         ),
         search.AddedHypothesis(hypothesis=second, rivals=rivals, others=[]),
         search.AddedHypothesis(hypothesis=third, rivals=[], others=[]),
     ]
     needless = hypothesis("gravity", -16.0, 0.5)
-    monkeypatch.setattr(search, "_beside", lambda *_: (None, [needless]))
-    monkeypatch.setattr(search, "_with", lambda one, last: one)
+    monkeypatch.setattr(search, "alternatives_beside", lambda *_: (small_fit(), [needless]))
     monkeypatch.setattr(search, "refitted", lambda problem, one, fitted: one)
     monkeypatch.setattr(search, "refined", lambda problem, one, used, log: one)
-    found = search.revised(object.__new__(Problem), added, set(), lambda said: None)
-    assert [one.hypothesis.effect.name for one in found] == ["stretch", "friction"]
-    assert [[rival.effect.name for rival in one.rivals] for one in found] == [["bending", "gravity"], []]
+    found = search.revised(small_problem(), added, set(), ignore)
+    assert names([one.hypothesis for one in found]) == ["stretch", "friction"]
+    assert [names(one.rivals) for one in found] == [["bending", "gravity"], []]
 
 
 @pytest.mark.parametrize(("second_mm", "added"), [(0.4, ["gravity", "tool_scale"]), (0.55, [])])
-def test_of_two_that_are_added_together_the_second_foretells_better_than_the_first_alone(monkeypatch, second_mm, added):
+def test_of_two_effects_added_together_the_second_predicts_better_than_the_first_alone(monkeypatch, second_mm, added):
     first, second = hypothesis("gravity", 300.0, 0.5, 0.5), hypothesis("tool_scale", 200.0, second_mm, second_mm)
     monkeypatch.setattr(search, "fitted_hypotheses", lambda *_: [second])
     monkeypatch.setattr(search, "refined", lambda problem, one, used, log: one)
-    monkeypatch.setattr(search, "replace", lambda one, **changed: one)
-    monkeypatch.setattr(search, "FitContext", lambda **said: context(0.5, 0.5))
     before = context(1.0, 1.0, left=100.0)
-    found = search._two(object.__new__(Problem), before, [], [first], 0.0, set(), lambda said: None)
-    assert [one.hypothesis.effect.name for one in found] == added
+    found = search.two_effects(small_problem(), before, [], [first], 0.0, set(), ignore)
+    assert names([one.hypothesis for one in found]) == added
 
 
-def test_a_size_is_as_sure_as_one_part_alone_makes_it_and_as_what_any_sheet_has():
-    problem, one = object.__new__(Problem), hypothesis("bed", 300.0, 0.5, 0.5, 0.5, 0.5)
-    vars(problem).update(own=np.array([1, 7]), own_sd=np.array([0.3, 9.0]))
-    vars(one).update(fitted=SimpleNamespace(named=np.array([0, 1, 2, 5])), sds=np.array([0.1, 0.2, 0.3, 0.4]))
+def test_the_reported_sd_is_that_of_one_part_and_of_the_nuisance_parameter():
+    """By hand: twice the standard deviation for four parts, and 0.3 of the nuisance parameter 1 in squares."""
+    problem = replace(small_problem(), own=np.array([1, 7]), own_sd=np.array([0.3, 9.0]))
+    fitted = small_fit(theta=np.zeros(8), named=np.array([0, 1, 2, 5]))
+    one = hypothesis("bed", 300.0, 0.5, 0.5, 0.5, 0.5)
+    one = replace(one, fitted=fitted, sds=np.array([0.1, 0.2, 0.3, 0.4]))
     np.testing.assert_allclose(reported_sd(problem, one), [0.2, 0.5, 0.6])

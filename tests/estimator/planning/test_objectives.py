@@ -19,7 +19,7 @@ N = 7
 
 @pytest.fixture
 def state():
-    """x, rest, b and a covariance."""
+    """Return x, rest, b and a covariance."""
     draw = np.random.default_rng(0)
     root = draw.normal(size=(N, N))
     return tuple(
@@ -37,10 +37,10 @@ def test_uwd_is_the_norm_of_the_papers_matrix(state):
 
 def test_a_pull_that_displaces_more_may_teach_less():
     """A particle shows its stiffness by as much as it moves: one that moves by 2 against three that move by 1 each."""
-    known = jnp.eye(3)
-    one, three = jnp.diag(jnp.array([2.0, 0.0, 0.0])), jnp.eye(3)
-    displaced = [uncertainty_weighted_displacement(x, jnp.zeros((3, 3)), known) for x in (one, three)]
-    entropy = [log_shrinkage(jnp.zeros((3, 3, 3)).at[:, :, 0].set(x), known, 1.0) for x in (one, three)]
+    prior = jnp.eye(3)
+    one_far, all_near = jnp.diag(jnp.array([2.0, 0.0, 0.0])), jnp.eye(3)
+    displaced = [uncertainty_weighted_displacement(x, jnp.zeros((3, 3)), prior) for x in (one_far, all_near)]
+    entropy = [log_shrinkage(jnp.zeros((3, 3, 3)).at[:, :, 0].set(x), prior, 1.0) for x in (one_far, all_near)]
     assert displaced[0] > displaced[1]
     np.testing.assert_allclose(entropy, [-np.log(5), -3 * np.log(2)])
     assert entropy[0] > entropy[1]
@@ -53,29 +53,29 @@ def test_the_boundary_energy_is_that_of_its_springs(state):
     assert boundary_energy(rest, rest, b) == 0
 
 
-def test_the_workspace_keeps_the_tip_above_the_ground_and_as_printed_would_not():
+def test_the_workspace_term_keeps_the_tip_above_the_ground_and_the_printed_one_would_not():
     above, below = jnp.array([0.0, 0.0, 0.01]), jnp.array([0.0, 0.0, -0.01])
     assert workspace(above) == 1 and workspace(below) > 1
     assert outside(above) == 0 and outside(below) > 0
     assert jax.grad(outside)(below)[2] < 0
-    least = 1.0
-    printed = [max(0.0, least - float(workspace(tip))) for tip in (above, below)]
+    omega_min = 1.0
+    printed = [max(0.0, omega_min - float(workspace(tip))) for tip in (above, below)]
     assert printed == [0, 0]
 
 
 def test_the_shrinkage_is_twice_the_fall_of_the_entropy(state):
     """By the filter's own update in information form, with the 1/2 that the paper's entropy lacks."""
     *_, covariance = state
-    slope = jnp.asarray(np.random.default_rng(1).normal(size=(N, 4, 3)))
+    dx_db = jnp.asarray(np.random.default_rng(1).normal(size=(N, 4, 3)))
     before = BoundaryBelief(precision=jnp.linalg.inv(covariance), shift=jnp.zeros(N))
-    flat = slope.reshape(N, -1)
+    flat = dx_db.reshape(N, -1)
     after = before.add(flat @ flat.T / 0.3**2, jnp.zeros(N))
-    assert log_shrinkage(slope, covariance, 0.3) == pytest.approx(2 * (after.entropy() - before.entropy()))
+    assert log_shrinkage(dx_db, covariance, 0.3) == pytest.approx(2 * (after.entropy() - before.entropy()))
 
 
 def test_the_shrinkage_survives_where_the_determinant_does_not():
     """At 600 particles |I - K J| is 0 in float64."""
-    slope = jnp.broadcast_to(10.0 * jnp.eye(600)[:, :, None], (600, 600, 3))
-    found = log_shrinkage(slope, jnp.eye(600), 1.0)
+    dx_db = jnp.broadcast_to(10.0 * jnp.eye(600)[:, :, None], (600, 600, 3))
+    found = log_shrinkage(dx_db, jnp.eye(600), 1.0)
     assert found == pytest.approx(-600 * np.log(301))
     assert np.exp(found) == 0

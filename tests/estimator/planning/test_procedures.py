@@ -1,4 +1,4 @@
-"""Where a procedure cuts and sews, and how long it looks at what it sewed."""
+"""Procedures: where they cut and sew, and how long they explore what was sewn."""
 
 import equinox as eqx
 import numpy as np
@@ -10,7 +10,13 @@ from jiggle_mj.estimate import Detection, Sheet
 from jiggle_mj.estimator.estimator import Estimator
 from jiggle_mj.estimator.planning.information_policy import InformationPolicy
 from jiggle_mj.estimator.planning.policy import Decision
-from jiggle_mj.estimator.planning.procedures import CERTAIN, CYCLE, Sew, free_stretch, tour
+from jiggle_mj.estimator.planning.procedures import (
+    CERTAIN_LOG_BAYES_FACTOR,
+    MAX_CYCLE_STEPS,
+    Sew,
+    free_stretch,
+    tour,
+)
 from tests.support.small_sheet import sheet, sheet_prior
 
 LENGTH, WIDTH = 0.02, 7e-3
@@ -34,17 +40,17 @@ def test_the_surest_free_stretch_lies_where_nothing_is_attached():
     np.testing.assert_allclose(np.linalg.norm(path[1] - path[0]), LENGTH)
 
 
-def test_where_nothing_is_known_to_be_free_there_is_none():
+def test_where_no_stretch_is_known_to_be_free_there_is_none():
     before = eqx.filter_jit(lambda belief: belief.sweep(belief.gaussian()).mixture().attached)(sheet_prior())
-    assert stretch(np.asarray(before)) is None, "nothing was seen yet"
+    assert stretch(np.asarray(before)) is None, "nothing was observed yet"
     assert stretch(np.full(sheet().n, 0.3)) is None
     assert stretch(np.full(sheet().n, 0.0)) is not None
 
 
-class Looking(InformationPolicy):
-    """Moves until it is told to leave."""
+class Exploring(InformationPolicy):
+    """Policy that moves until it has to leave."""
 
-    def __init__(self, *, enough=None, about=None):
+    def __init__(self, *, min_gain=None, about=None):
         self.about, self.over = about, ""
 
     def leave(self, why):
@@ -54,15 +60,15 @@ class Looking(InformationPolicy):
         return self.over or (Move(to=np.zeros(3)), "it teaches")
 
 
-class Misses(Looking):
-    """Goes on, whatever was refused."""
+class GoesOn(Exploring):
+    """Policy that goes on, whatever was refused."""
 
     def refused(self, error):
         return True
 
 
-class Seen(Estimator):
-    """Believes that all is free; what it saw of a suture after each step is told beforehand."""
+class KnownFactors(Estimator):
+    """Estimator that believes that all is free, with given log Bayes factors of a suture after each step."""
 
     def __init__(self, factors):
         self.changes, self.factors = [], list(factors)
@@ -84,42 +90,43 @@ class Seen(Estimator):
 
 
 def sewing(*factors):
-    """What a procedure plans, how it ends, and which particles it asked about after the suture."""
-    looks = []
+    """Return what a procedure plans, how it ends, and which particles it asked about after the suture."""
+    policies = []
 
-    def look(**asked):
-        looks.append(Looking(**asked))
-        return looks[-1]
+    def new_policy(**asked):
+        policies.append(Exploring(**asked))
+        return policies[-1]
 
-    estimator, sew, planned = Seen(factors), Sew(look, length=LENGTH, width=WIDTH, stiffness=1.0), []
-    for _ in range(3 * CYCLE):
-        one = sew.plan(estimator)
-        if isinstance(one, str):
-            return planned, one, looks[-1].about
-        planned.append(one[0])
-        if isinstance(one[0], Suture):
-            estimator.changes.append(one[0])
+    estimator, sew = KnownFactors(factors), Sew(new_policy, length=LENGTH, width=WIDTH, stiffness=1.0)
+    planned = []
+    for _ in range(3 * MAX_CYCLE_STEPS):
+        decision = sew.plan(estimator)
+        if isinstance(decision, str):
+            return planned, decision, policies[-1].about
+        planned.append(decision[0])
+        if isinstance(decision[0], Suture):
+            estimator.changes.append(decision[0])
     raise AssertionError("no end")
 
 
-@pytest.mark.parametrize(("sign", "said"), [(1, "the suture holds"), (-1, "the suture does not hold")])
-def test_a_suture_is_looked_at_until_it_is_known_whether_it_holds(sign, said):
-    planned, why, about = sewing(None, sign * (CERTAIN - 1), sign * (CERTAIN + 1))
-    assert isinstance(planned[CYCLE], Suture)
-    assert len(planned) == CYCLE + 1 + 2
-    assert why == f"{said}; what was done is seen"
-    band = np.linalg.norm(sheet().rest[about, :2] - np.mean(planned[CYCLE].path, axis=0), axis=1)
+@pytest.mark.parametrize(("sign", "ended"), [(1, "the suture holds"), (-1, "the suture does not hold")])
+def test_a_suture_is_explored_until_it_is_known_whether_it_holds(sign, ended):
+    planned, why, about = sewing(None, sign * (CERTAIN_LOG_BAYES_FACTOR - 1), sign * (CERTAIN_LOG_BAYES_FACTOR + 1))
+    assert isinstance(planned[MAX_CYCLE_STEPS], Suture)
+    assert len(planned) == MAX_CYCLE_STEPS + 1 + 2
+    assert why == f"{ended}; the result of the last act is known"
+    band = np.linalg.norm(sheet().rest[about, :2] - np.mean(planned[MAX_CYCLE_STEPS].path, axis=0), axis=1)
     assert 0 < len(band) < sheet().n and band.max() <= (LENGTH + WIDTH) / 2
 
 
-def test_a_suture_that_is_not_surely_seen_is_looked_at_for_a_cycle():
-    planned, why, _ = sewing(CERTAIN / 2)
-    assert len(planned) == 2 * CYCLE + 1
+def test_a_suture_that_stays_undecided_is_explored_for_a_cycle():
+    planned, why, _ = sewing(CERTAIN_LOG_BAYES_FACTOR / 2)
+    assert len(planned) == 2 * MAX_CYCLE_STEPS + 1
     assert why == "the suture holds; the steps of this cycle are done"
 
 
-def test_what_cannot_be_sewn_is_the_end_but_a_grasp_that_misses_is_for_who_looks():
-    procedure = Sew(Misses, length=LENGTH, width=WIDTH, stiffness=1.0)
+def test_a_refused_suture_is_the_end_and_a_refused_grasp_is_for_the_exploring_policy():
+    procedure = Sew(GoesOn, length=LENGTH, width=WIDTH, stiffness=1.0)
     point = np.zeros(3)
     for action, goes_on in (
         (Grasp(point=point, radius=8e-3), True),

@@ -1,4 +1,4 @@
-"""The tool's kinematics through MJX against MuJoCo's own, and the workspace that a plan keeps to."""
+"""The tool's kinematics through MJX against MuJoCo's own."""
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,13 @@ from jiggle_mj.errors import OptionError
 from jiggle_mj.estimator.planning.tool_kinematics import ToolKinematics, clearances
 from jiggle_mj.scenes.tissue.model import TWEEZER
 
+OPEN = 0.35
+"""Angle of each open jaw, the upper limit of its hinge's range in the tweezer's MJCF [rad]."""
+ROUNDING = 1e-9
+"""Difference of two float64 kinematics that do the same in another order [m, or per unit of the quaternion]."""
+DIFFERENCE, DIFFERENCE_ERROR = 1e-6, 1e-7
+"""Step of finite differences, and their error by rounding and curvature [m per unit of the quaternion]."""
+
 
 @pytest.fixture(scope="module")
 def tweezer() -> ToolKinematics:
@@ -17,18 +24,18 @@ def tweezer() -> ToolKinematics:
 
 
 def lowest(tip: np.ndarray, quat: np.ndarray) -> float:
-    """Of the tool's surface, by MuJoCo and points on each capsule's axis."""
+    """Return the height of the tool's lowest point [m], by MuJoCo and points on each capsule's axis."""
     model = mujoco.MjModel.from_xml_path(str(TWEEZER))
-    data, found = mujoco.MjData(model), []
+    data, heights = mujoco.MjData(model), []
     data.mocap_pos[0], data.mocap_quat[0] = tip, quat
     along = np.linspace(-1, 1, 3)
-    for angle in (0.0, 0.35):
+    for angle in (0.0, OPEN):
         data.qpos[:] = angle
         mujoco.mj_kinematics(model, data)
-        for (radius, half, _), centre, turn in zip(model.geom_size, data.geom_xpos, data.geom_xmat, strict=True):
-            axis = turn.reshape(3, 3)[:, 2]
-            found.append((centre + half * along[:, None] * axis)[:, 2].min() - radius)
-    return min(found)
+        for (radius, half, _), centre, rotation in zip(model.geom_size, data.geom_xpos, data.geom_xmat, strict=True):
+            axis = rotation.reshape(3, 3)[:, 2]
+            heights.append((centre + half * along[:, None] * axis)[:, 2].min() - radius)
+    return min(heights)
 
 
 def poses(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -41,25 +48,25 @@ def test_clearance_is_that_of_mujoco_in_any_pose(tweezer):
     with jax.enable_x64(True):
         for tip, quat in zip(*poses(20), strict=True):
             found = clearances(tweezer, jnp.asarray(tip)[None], jnp.asarray(quat))
-            assert float(found[0]) == pytest.approx(lowest(tip, quat), abs=1e-9)
+            assert float(found[0]) == pytest.approx(lowest(tip, quat), abs=ROUNDING)
 
 
 def test_upright_the_tip_is_the_lowest_point(tweezer):
     with jax.enable_x64(True):
         tips = jnp.asarray([[0.0, 0.0, 0.0], [0.01, -0.02, 0.03]])
-        np.testing.assert_allclose(clearances(tweezer, tips, jnp.asarray([1.0, 0, 0, 0])), tips[:, 2], atol=1e-9)
+        np.testing.assert_allclose(clearances(tweezer, tips, jnp.asarray([1.0, 0, 0, 0])), tips[:, 2], atol=ROUNDING)
 
 
 def test_clearance_is_differentiable_in_tip_and_orientation(tweezer):
     with jax.enable_x64(True):
         height = jax.jit(lambda tip, quat: tweezer.clearance(tip, quat))
-        slope = jax.jit(jax.grad(height, argnums=(0, 1)))
+        gradient = jax.jit(jax.grad(height, argnums=(0, 1)))
         for tip, quat in zip(*map(jnp.asarray, poses(3)), strict=True):
-            by_tip, by_quat = slope(tip, quat)
-            np.testing.assert_allclose(by_tip, [0, 0, 1], atol=1e-9)
+            by_tip, by_quat = gradient(tip, quat)
+            np.testing.assert_allclose(by_tip, [0, 0, 1], atol=ROUNDING)
             for k in range(4):
-                up, down = (float(height(tip, quat.at[k].add(step))) for step in (1e-6, -1e-6))
-                assert float(by_quat[k]) == pytest.approx((up - down) / 2e-6, abs=1e-7)
+                up, down = (float(height(tip, quat.at[k].add(step))) for step in (DIFFERENCE, -DIFFERENCE))
+                assert float(by_quat[k]) == pytest.approx((up - down) / (2 * DIFFERENCE), abs=DIFFERENCE_ERROR)
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from jiggle_mj.actions import Action, Grasp, Move, Release, Wait
 from jiggle_mj.cli.terminal import patient
 from jiggle_mj.errors import ActionError, OptionError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
-from jiggle_mj.estimator.planning import information_policy as information
-from jiggle_mj.estimator.planning.information_policy import LOST, InformationPolicy
+from jiggle_mj.estimator.planning.information_config import InformationPolicyConfig
+from jiggle_mj.estimator.planning.information_policy import InformationPolicy
 from jiggle_mj.estimator.planning.policy import STEP, Policy
 from jiggle_mj.eval.runs.acting import actions, check_goes_with, most_actions, policy_named
 from jiggle_mj.eval.runs.experiment import run_scene
@@ -134,17 +134,21 @@ def test_ours_without_regrasping_closes_the_jaws_and_lifts_nothing_unasked(scene
 
 
 def test_a_grasp_from_which_little_is_to_be_learned_is_left(ours):
-    policy = InformationPolicy(Limits(), radius=8e-3, seed=0, regrasps=False, enough=np.inf)
+    policy = InformationPolicy(Limits(), radius=8e-3, seed=0, regrasps=False, min_gain=np.inf)
     assert policy.plan(ours[1].estimator) == "little is left to learn"
 
 
 @pytest.mark.parametrize(("cost", "goes"), [(3, True), (1e9, False)])
-def test_another_place_is_worth_going_to_if_it_teaches_more_than_it_costs_to_get_there(ours, monkeypatch, cost, goes):
+def test_another_place_is_worth_going_to_if_it_teaches_more_than_it_costs_to_get_there(ours, cost, goes):
     _, loop = ours
     here = loop.estimator.tool.position + np.array([0, 0, STEP])
-    monkeypatch.setattr(information, "REGRASP", cost)
-    monkeypatch.setattr(InformationPolicy, "_best_pull", lambda *_: (here, 1e-3))
-    action, why = InformationPolicy(Limits(), radius=8e-3, seed=0, enough=0.0).plan(loop.estimator)
+
+    class OnePull(InformationPolicy):
+        def best_pull(self, estimator, predictor):
+            return here, 1e-3
+
+    config = InformationPolicyConfig(regrasp_steps=cost, min_gain=0.0)
+    action, why = OnePull(Limits(), radius=8e-3, seed=0, config=config).plan(loop.estimator)
     assert (why == "another place teaches more") is goes
     assert isinstance(action, Move)
     np.testing.assert_array_equal(action.to, loop.estimator.hold.tip if goes else here)
@@ -181,7 +185,7 @@ def test_a_grasp_that_slipped_is_let_go(ours, monkeypatch):
     _, loop = ours
     if loop.estimator.hold is None:
         pytest.fail("the last step of the run has tissue in the jaws")
-    monkeypatch.setattr(Estimator, "slip", property(lambda _: 2 * LOST))
+    monkeypatch.setattr(Estimator, "slip", property(lambda _: 2 * InformationPolicyConfig().max_slip))
     fresh = InformationPolicy(Limits(), radius=8e-3, seed=0)
     action, why = fresh.plan(loop.estimator)
     assert isinstance(action, Release) and "slipped out of the jaws by 10 mm" in why

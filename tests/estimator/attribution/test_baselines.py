@@ -1,0 +1,35 @@
+"""Held-out predictions without a model."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
+from tests.support.small_sheet import sheet
+
+ERROR = 5e-4
+"""Length of the error of each position [m]."""
+
+
+def test_baselines_of_particles_that_move_a_share_of_the_tools_displacement(light):
+    """Each particle moves its share exactly, with an error of half a millimetre in the last part."""
+    rest, share = sheet().rest, np.random.default_rng(0).uniform(size=(len(sheet().rest), 1))
+    last = light[2].frames[-1].part
+    frames = [
+        dataclasses.replace(
+            one,
+            frame=dataclasses.replace(
+                one.frame, y=jnp.asarray(rest + share * np.asarray(one.frame.displacement) + error)
+            ),
+        )
+        for one in light[2].frames
+        for error in (ERROR * (one.part == last and bool(np.any(one.frame.displacement))) / np.sqrt(3),)
+    ]
+    of_part = [one for one in frames if one.part == last]
+    moved = np.mean([bool(np.any(one.frame.displacement)) for one in of_part])
+    assert in_proportion(frames, last) == pytest.approx(ERROR * np.sqrt(moved))
+    free = ~np.asarray(of_part[0].frame.held)
+    displacement = np.concatenate([(np.asarray(one.frame.y) - rest)[free] for one in of_part])
+    assert unmoved(frames, last) == pytest.approx(np.sqrt(np.mean(np.sum(displacement**2, axis=1))))

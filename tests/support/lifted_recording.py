@@ -1,0 +1,102 @@
+"""Lifts by our own engine as recordings, for tests of closing the loop over them."""
+
+import dataclasses
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jiggle_mj.estimator.attribution.closing import Closed, close_the_loop
+from jiggle_mj.estimator.attribution.dataset import Dataset, collect_dataset
+from jiggle_mj.estimator.attribution.discrepancy import discrepancy
+from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.effects import LIBRARY
+from jiggle_mj.estimator.filters.evidence import Evidence
+from jiggle_mj.estimator.physics.environment import Weight
+from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
+from tests.support.small_sheet import (
+    DECLARATION,
+    GRIP_RADIUS,
+    STIFFNESS,
+    attached,
+    lifts,
+    sheet,
+    sheet_balance,
+    sheet_energy,
+)
+
+NOISE = 1e-4
+"""Standard deviation of each observed coordinate [m]."""
+N_STILL = 10
+"""Still frames before the first grasp."""
+PERIOD_NS = 250_000_000
+"""Time between frames [ns]."""
+GRIP_PRECISION = 1e6
+"""Precision of the held particles' positions [1/m^2]."""
+SMALL_LIBRARY = tuple(
+    effect for effect in LIBRARY if effect.name in ("gravity", "stretch", "bending", "friction", "tool_scale", "bed")
+)
+"""Effects that the tests search for; fewer than the library, to save time."""
+
+
+@cache
+def lifted(gravity: float) -> tuple[np.ndarray, ...]:
+    """Return the states of the shared lifts under a share of the declared gravity; what is held follows the tip."""
+    kinds = [type(term) for term in sheet_energy().terms]
+    energy = eqx.tree_at(
+        lambda e: e.terms[kinds.index(Weight)].gravity, sheet_energy(), replace_fn=lambda g: gravity * g
+    )
+    balance, k = sheet_balance(1e-4).of(energy), DECLARATION.membrane_stiffness
+    s, states = jnp.asarray(attached() * STIFFNESS / (STIFFNESS + k)), []
+    first = {lift.grasp: lift.tip for lift in lifts()[::-1]}
+    predict = eqx.filter_jit(balance.predict)
+    for lift, before in zip(lifts(), (None, *lifts()), strict=False):
+        start = sheet().rest if before is None or before.grasp != lift.grasp else states[-1]
+        held, to = jnp.asarray(lift.held), sheet().rest + lift.tip - first[lift.grasp]
+        precision = jnp.broadcast_to(GRIP_PRECISION * jnp.eye(3)[None], (len(s), 3, 3))
+        evidence = Evidence(y=jnp.asarray(to), precision=precision, held=held, force_unknown=held)
+        states.append(np.asarray(predict(jnp.asarray(np.where(lift.held[:, None], to, start)), s, evidence)))
+    return tuple(states)
+
+
+def observed(gravity: float, *, tool_scale: float = 1.0) -> list[Observation]:
+    """Return still frames, then the lifts: noisy tracked points, and the tool as it reports."""
+    frames = [(sheet().rest, np.array([0.0, 0.0, 0.05]), 0)] * N_STILL
+    frames += [(x, lift.tip, lift.grasp) for x, lift in zip(lifted(gravity), lifts(), strict=True)]
+    first = {grasp: tip for _, tip, grasp in frames[::-1]}
+    return [
+        Observation(
+            index=k,
+            time=k * PERIOD_NS,
+            tool=ToolState(
+                position=first[grasp] + (tip - first[grasp]) / tool_scale,
+                quat_wxyz=np.array([1.0, 0, 0, 0]),
+                closed=grasp > 0,
+                grasp=grasp,
+                radius=GRIP_RADIUS,
+            ),
+            points=MeasuredPoints(
+                positions=x + NOISE * np.random.default_rng(k).normal(size=x.shape),
+                track_id=np.arange(len(x)),
+                sd=NOISE,
+            ),
+        )
+        for k, (x, tip, grasp) in enumerate(frames)
+    ]
+
+
+def closed_over(observations: list[Observation]) -> tuple[Closed, dict, Dataset]:
+    """Close the loop over a recording, and return the result, the content of discrepancy.json and the dataset."""
+    dataset = collect_dataset(DECLARATION, None, observations)
+    with jax.enable_x64(True), one_thread():
+        closed = close_the_loop(dataset, library=SMALL_LIBRARY)
+        return closed, discrepancy(closed, dataset), dataset
+
+
+def report_further(observation: Observation, distance: float) -> Observation:
+    """Return an observation whose tool reports a position that is higher by a distance [m]."""
+    tool = observation.tool
+    moved = dataclasses.replace(tool, position=tool.position + np.array([0.0, 0.0, distance]))
+    return dataclasses.replace(observation, tool=moved)
