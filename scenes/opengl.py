@@ -1,21 +1,21 @@
-"""Imports MuJoCo with offscreen OpenGL, or without any where the machine has none: physics needs no picture.
+"""Import of MuJoCo with offscreen OpenGL, or without any where the machine has none: the physics needs no images.
 
-MuJoCo reads MUJOCO_GL and loads the driver's libraries while it is imported, so this runs before any other import of
-it. Whether a context can be made is known only when a renderer is built: see `stereo`.
+MuJoCo reads MUJOCO_GL and loads the driver's libraries while it is imported, so this module runs before any other
+import of it. Only a renderer shows whether a context can be made: see `sensing/stereo.py`.
 """
 
 import os
 import sys
 
-TOO_LATE = "mujoco" in sys.modules and not os.environ.get("MUJOCO_GL")
-"""MuJoCo was imported without a backend before this package was."""
+MUJOCO_CAME_FIRST = "mujoco" in sys.modules and not os.environ.get("MUJOCO_GL")
+"""Whether MuJoCo was imported, without a backend, before this package."""
 os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL") or "egl"
 
 BACKEND = os.environ["MUJOCO_GL"]
-"""The OpenGL backend that was asked for."""
+"""OpenGL backend that was requested."""
 
 IMPORT_ERROR: Exception | None = None
-"""Why the backend's libraries could not be loaded; None if they were."""
+"""Error from loading the backend's libraries; None if they were loaded."""
 
 try:
     import mujoco
@@ -28,8 +28,8 @@ except (AttributeError, ImportError, OSError, RuntimeError) as error:
 
 
 def no_opengl(error: Exception) -> str:
-    """What to tell someone whose machine has no offscreen OpenGL, in one line."""
-    if TOO_LATE:
+    """Return the message for a machine without offscreen OpenGL, in one line."""
+    if MUJOCO_CAME_FIRST:
         return (
             "No offscreen OpenGL: mujoco was imported before jiggle_mj. Import jiggle_mj first, or set MUJOCO_GL=egl."
         )

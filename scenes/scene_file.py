@@ -1,6 +1,7 @@
-"""Scene files: one TOML table per section, read strictly.
+"""Reading and writing of scene files: one TOML table for each section of `scene/scene.py`, read strictly.
 
-Unknown keys, wrong types and missing files are refused with the key, the value and what is allowed.
+Unknown keys, wrong types and missing files are refused with the key, the value and what is allowed. What the keys mean
+to MuJoCo is in `tissue/model.py`.
 """
 
 import math
@@ -12,7 +13,7 @@ from typing import Any
 
 from jiggle_mj.errors import SceneError
 
-from .disturbances.registry import named
+from .disturbances.registry import disturbance_class
 from .scene.attachments import SHAPES, Attachment
 from .scene.disturbance import Disturbance
 from .scene.scene import (
@@ -47,12 +48,16 @@ SECTIONS: dict[str, type[Section]] = {
         DeclaredConfig,
     )
 }
-FOLDER = Path(__file__).parent
+"""Class of each table of a scene file, except those of the arrays `attachments` and `disturbances`."""
+SHIPPED_FOLDER = Path(__file__).parent
+"""Folder of the shipped scenes."""
+MAX_SEED = 2**32 - 1
+"""Largest seed of a scene."""
 
 
 def shipped_scenes() -> tuple[str, ...]:
-    """Names of the scenes that come with the package."""
-    return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
+    """Return the names of the scenes that come with the package."""
+    return tuple(sorted(path.stem for path in SHIPPED_FOLDER.glob("*.toml")))
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
@@ -63,7 +68,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
     """
     path = Path(name_or_path)
     if str(name_or_path) in shipped_scenes():
-        path = FOLDER / f"{name_or_path}.toml"
+        path = SHIPPED_FOLDER / f"{name_or_path}.toml"
     elif path.suffix != ".toml":
         raise SceneError(
             f"no scene named {str(name_or_path)!r}; shipped scenes are {', '.join(shipped_scenes())}, "
@@ -79,11 +84,15 @@ def load_scene(name_or_path: str | Path) -> Scene:
 
 
 def scene_from_table(table: dict[str, Any], *, name: str) -> Scene:
-    """Build a scene from parsed TOML."""
+    """Return a scene from parsed TOML.
+
+    Raises:
+        SceneError: a key or value that is not allowed.
+    """
     known = ["seed", "secret", "attachments", "disturbances", *SECTIONS]
     _refuse_unknown(table, known, where="the scene")
     seed = table.get("seed", 0)
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
         raise SceneError(f"seed = {seed!r}: must be a whole number in [0, 2^32).")
     secret = table.get("secret", False)
     if not isinstance(secret, bool):
@@ -95,7 +104,7 @@ def scene_from_table(table: dict[str, Any], *, name: str) -> Scene:
 
 
 def _tables(table: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The tables of an array, each with where it stands."""
+    """Yield the tables of an array, each with its place for messages."""
     entries = table.get(key, [])
     if not isinstance(entries, list):
         raise SceneError(f"{key} = {entries!r}: must be an array of tables, each headed [[{key}]].")
@@ -113,7 +122,7 @@ def _attachment(table: dict[str, Any], *, where: str) -> Attachment:
 
 
 def _disturbance(table: dict[str, Any], *, where: str) -> Disturbance:
-    return _section(named(table.get("name")), {k: v for k, v in table.items() if k != "name"}, where=where)
+    return _section(disturbance_class(table.get("name")), {k: v for k, v in table.items() if k != "name"}, where=where)
 
 
 def _section(cls: type[Section], table: object, *, where: str) -> Any:
@@ -136,11 +145,11 @@ def _refuse_unknown(table: dict[str, Any], known: list[str], *, where: str) -> N
 
 
 def scene_table(scene: Scene) -> dict[str, Any]:
-    """The scene as a table that could stand in a scene file; every key is written out."""
+    """Return the scene as the table of a scene file, with every key; `scene_from_table` reads it back."""
     table: dict[str, Any] = {"seed": scene.seed, "secret": scene.secret}
     shape_names = {cls: shape for shape, cls in SHAPES.items()}
     table["attachments"] = [{"shape": shape_names[type(shape)], **_plain(shape)} for shape in scene.attachments]
-    table["disturbances"] = [{"name": one.kind(), **_plain(one)} for one in scene.disturbances]
+    table["disturbances"] = [{"name": item.kind(), **_plain(item)} for item in scene.disturbances]
     return table | {key: _plain(getattr(scene, key)) for key in SECTIONS}
 
 

@@ -1,1 +1,1 @@
-"""What a scene can carry without telling the estimator."""
+"""The disturbances of a scene, which the estimator is not informed of; `scene/disturbance.py` says how to add one."""

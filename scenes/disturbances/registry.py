@@ -1,6 +1,6 @@
-"""All disturbances by name, and how the command line writes them.
+"""All disturbances by name, and the text form that the command line and reports use.
 
-The names are those of the estimator's effects: what a scene calls `gravity` is found as `gravity`.
+A disturbance has the name of the estimator's effect for it: the effect `gravity` explains the disturbance `gravity`.
 """
 
 from collections.abc import Iterable
@@ -64,18 +64,19 @@ DISTURBANCES: dict[str, type[Disturbance]] = {
         image.Exposure,
     )
 }
+"""Class of each disturbance by its name, in the order of docs/DISTURBANCES.md."""
 MATERIAL = (sheet.Inclusion, sheet.Heterogeneity, sheet.Anisotropy, sheet.Poisson, sheet.Stretch, sheet.Bending)
-"""Those that make the sheet another elastic sheet."""
+"""Disturbances that change the elastic constants of the sheet; the load tests measure them."""
 
 
-def named(name: object) -> type[Disturbance]:
-    """The disturbance of that name.
+def disturbance_class(name: object) -> type[Disturbance]:
+    """Return the class of the disturbance with this name.
 
     Raises:
-        SceneError: there is none; the message lists those there are.
+        SceneError: there is none; the message lists all names.
     """
     if name is None:
-        raise SceneError('a disturbance lacks its name; write name = "gravity", say.')
+        raise SceneError('a disturbance lacks its name; write for example name = "gravity".')
     if not isinstance(name, str) or name not in DISTURBANCES:
         near = get_close_matches(str(name), DISTURBANCES, n=1)
         hint = f"; did you mean {near[0]}?" if near else ";"
@@ -83,10 +84,10 @@ def named(name: object) -> type[Disturbance]:
     return DISTURBANCES[name]
 
 
-def described(disturbance: Disturbance) -> str:
-    """Name, magnitude, and what else differs from the defaults: gravity=1 [start=3, tilt_deg=20]."""
-    others = [f for f in fields(disturbance) if f.name != "magnitude" and getattr(disturbance, f.name) != f.default]
-    more = ", ".join(f"{f.name}={_plain(getattr(disturbance, f.name))}" for f in others)
+def describe(disturbance: Disturbance) -> str:
+    """Return name, magnitude, and all other keys that differ from their defaults: gravity=1 [start=3, tilt_deg=20]."""
+    changed = [f for f in fields(disturbance) if f.name != "magnitude" and getattr(disturbance, f.name) != f.default]
+    more = ", ".join(f"{f.name}={_plain(getattr(disturbance, f.name))}" for f in changed)
     return f"{disturbance.kind()}={disturbance.magnitude:g}" + (f" [{more}]" if more else "")
 
 
@@ -95,10 +96,10 @@ def _plain(value: object) -> str:
 
 
 def disturbed(scene: Scene, texts: Iterable[str]) -> Scene:
-    """A scene with more disturbances, each written as NAME or NAME=MAGNITUDE.
+    """Return a scene with more disturbances, each written as NAME or NAME=MAGNITUDE.
 
     Raises:
-        SceneError: an unknown name, or a magnitude that is no number or out of its range.
+        SceneError: a name is unknown, or a magnitude is not a number or out of its range.
     """
     return replace(scene, disturbances=(*scene.disturbances, *map(_read, texts)))
 
@@ -108,7 +109,7 @@ def _read(text: str) -> Disturbance:
     base, dot, _ = name.partition(".")
     if dot and base in DISTURBANCES:
         raise SceneError(f"{text!r}: only the magnitude can be given here; other keys of {base} go into a scene file.")
-    cls = named(name)
+    cls = disturbance_class(name)
     try:
         return cls(**{"magnitude": float(magnitude)} if equals else {})
     except ValueError:

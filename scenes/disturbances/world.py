@@ -1,4 +1,4 @@
-"""Disturbances of what surrounds the sheet: weight, bed, friction, drag."""
+"""Disturbances of the sheet's surroundings: gravity, bed, friction, drag."""
 
 import math
 from dataclasses import dataclass
@@ -11,25 +11,29 @@ from ..scene.disturbance import TissueDisturbance
 from ..scene.section import number
 from ..tissue.simulation import Simulation
 
+MIN_FRICTION = 1e-5
+"""Smallest friction coefficient that MuJoCo accepts."""
+
 
 def _tilted(tilt_deg: float, azimuth_deg: float) -> Float[np.ndarray, " 3"]:
-    """The upright direction, tilted towards an azimuth."""
+    """Return the vertical unit vector, tilted towards an azimuth."""
     tilt, azimuth = math.radians(tilt_deg), math.radians(azimuth_deg)
     return np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gravity(TissueDisturbance[Simulation]):
-    """Another weight, or a table that leans."""
+    """Another weight, or a tilted table."""
 
     magnitude: float = number(0.0, at_least=0, at_most=10)
-    """Times the weight; 0 is none."""
+    """Factor on the weight; 0 is none."""
     tilt_deg: float = number(0.0, unit="degrees", at_least=0, at_most=90)
+    """Angle of the weight from the vertical [degrees]."""
     azimuth_deg: float = number(0.0, unit="degrees", at_least=-360, at_most=360)
-    """Where a tilted weight pulls to, counter-clockwise from x."""
+    """Direction in which a tilted weight pulls, counter-clockwise from x [degrees]."""
 
     def begin(self, simulation: Simulation) -> None:
-        """Turn gravity."""
+        """Scale and tilt gravity."""
         g = np.linalg.norm(simulation.model.opt.gravity)
         simulation.model.opt.gravity[:] = -self.magnitude * g * _tilted(self.tilt_deg, self.azimuth_deg + 180)
 
@@ -42,36 +46,35 @@ class Friction(TissueDisturbance[Simulation]):
     """Coulomb coefficient."""
 
     def begin(self, simulation: Simulation) -> None:
-        """Of tissue and bed alike, since MuJoCo takes the larger of the two."""
+        """Set the friction of both tissue and bed, because MuJoCo takes the larger one."""
         model = simulation.model
-        least = 1e-5
-        """MuJoCo's least."""
-        model.flex_friction[:, 0] = max(self.magnitude, least)
-        model.geom_friction[_bed(model), 0] = max(self.magnitude, least)
+        model.flex_friction[:, 0] = max(self.magnitude, MIN_FRICTION)
+        model.geom_friction[_bed(model), 0] = max(self.magnitude, MIN_FRICTION)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bed(TissueDisturbance[Simulation]):
-    """A bed that is higher, leans, or gives way."""
+    """A bed that is higher, tilted or soft."""
 
     magnitude: float = number(2e-3, unit="m", at_least=-0.05, at_most=0.05)
-    """How much higher it is in the middle of the sheet."""
+    """Rise of the bed in the middle of the sheet [m]."""
     tilt_deg: float = number(0.0, unit="degrees", at_least=0, at_most=45)
+    """Angle of its normal from the vertical [degrees]."""
     azimuth_deg: float = number(0.0, unit="degrees", at_least=-360, at_most=360)
-    """Which way its normal leans, counter-clockwise from x."""
+    """Direction in which its normal tilts, counter-clockwise from x [degrees]."""
     softness: float = number(1.0, at_least=1, at_most=1e4)
-    """How many times less stiff its contact is."""
+    """Factor by which its contact is less stiff."""
 
     def begin(self, simulation: Simulation) -> None:
-        """Move the plane, and soften its contact with the sheet."""
+        """Move and tilt the plane, and soften its contact with the sheet."""
         model = simulation.model
         bed = _bed(model)
-        model.geom_sameframe[bed] = 0  # else MuJoCo takes the body's place for the geom's
+        model.geom_sameframe[bed] = 0  # otherwise MuJoCo uses the body's position for the geom
         model.geom_pos[bed, 2] += self.magnitude
         mujoco.mju_quatZ2Vec(model.geom_quat[bed], _tilted(self.tilt_deg, self.azimuth_deg))
-        share = np.array([1 / self.softness, 1 / math.sqrt(self.softness)])
-        model.geom_solref[bed] *= share
-        model.flex_solref[0] *= share
+        factor = np.array([1 / self.softness, 1 / math.sqrt(self.softness)])
+        model.geom_solref[bed] *= factor
+        model.flex_solref[0] *= factor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,13 +82,13 @@ class ViscousDrag(TissueDisturbance[Simulation]):
     """A liquid around the sheet."""
 
     magnitude: float = number(1.0, unit="Pa s", at_least=0, at_most=100)
-    """Its viscosity, as each vertex feels it: MuJoCo takes it for a box of 2.4 mm."""
+    """Viscosity [Pa s]; MuJoCo computes the drag of a box of 2.4 mm for each vertex."""
 
     def begin(self, simulation: Simulation) -> None:
-        """Fill the world."""
+        """Set the viscosity of the medium."""
         simulation.model.opt.viscosity = self.magnitude
 
 
 def _bed(model: mujoco.MjModel) -> int:
-    """Its id, -1 where there is none."""
+    """Return the id of the bed's geom; -1 without a bed."""
     return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "bed")

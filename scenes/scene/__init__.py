@@ -1,1 +1,1 @@
-"""What a scene says: sections, attachments, the grasp programme."""
+"""The contents of a scene: its sections with their checks, the attachments, and the grasp programme."""

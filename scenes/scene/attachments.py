@@ -1,7 +1,10 @@
-"""Where a tissue is attached: shapes in tissue coordinates, and the vertices that lie in them.
+"""Where and how a tissue is attached: shapes in tissue coordinates, and the vertices that lie in them.
 
-A vertex is attached when it is within half the shape's width of it; attachments are the union of the shapes. Where two
-shapes meet they must agree on how they hold, because a vertex is held in one way.
+A vertex is attached when it is within half the shape's width of the shape; attachments are the union of the shapes.
+Where two shapes meet they must agree on all values but the geometry, because a vertex has one spring or one weld.
+
+From a scene's stiffness to a spring: `owners` and `vertex_values` here, called by `tissue/model.py`, which compiles the
+joints and welds; then `tissue/anchors.py`, which makes a spring for each vertex; then its law in `tissue/springs.py`.
 """
 
 import math
@@ -20,7 +23,7 @@ from .section import Section, number, points, stiffness, vector
 
 
 def _cross(*corners: tuple[float, float]) -> bool:
-    """Whether two segments a-b and c-d cross within both."""
+    """Return whether two segments a-b and c-d cross within both."""
     a, b, c, d = map(np.array, corners)
 
     def side(p: Float[np.ndarray, " 2"], q: Float[np.ndarray, " 2"], r: Float[np.ndarray, " 2"]) -> float:
@@ -31,46 +34,46 @@ def _cross(*corners: tuple[float, float]) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Attachment(Section, ABC):
-    """A shape with a width and a stiffness; the subclasses say which shape."""
+    """Common values of all attachments; the subclasses add a shape with a width."""
 
     section: ClassVar[str] = "attachments"
     stiffness: float = stiffness()
     """Spring constant of each attached vertex [N/m]; infinity is a weld."""
     breaks_at: float = number(0.0, unit="N", at_least=0, at_most=1e6)
-    """Largest force; 0 for any."""
+    """Force above which it breaks [N]; 0 for never."""
     hardening: float = number(0.0, unit="1/m^2", at_least=0, at_most=1e12)
-    """c of a force k e (1 + c e^2), e the elongation beyond the slack."""
+    """c of the force k e (1 + c e^2), with e the elongation beyond the slack [1/m^2]."""
     slack: float = number(0.0, unit="m", at_least=0, at_most=0.05)
-    """Length up to which a spring is loose."""
+    """Length up to which a spring is loose [m]."""
     offset: tuple[float, float, float] = vector((0.0, 0.0, 0.0), length=3, unit="m")
-    """The anchor, from where the vertex lies at rest; world."""
+    """Anchor minus the vertex's rest position, world [m]."""
     yields_at: float = number(0.0, unit="m", at_least=0, at_most=1)
-    """Largest e; beyond it the anchor comes after. 0 for any."""
+    """Largest e [m]; beyond it the anchor follows the vertex. 0 for never."""
     creep: float = number(0.0, unit="1/s", at_least=0, at_most=100)
-    """Share of e by which the anchor comes after in a second."""
+    """Rate at which the anchor follows the vertex, as a share of e per second [1/s]."""
 
     def __post_init__(self) -> None:
-        """Check that a weld is asked for nothing that only a spring has."""
+        """Check that a weld has none of the values that only a spring can have."""
         super().__post_init__()
         given = [name for name in ("hardening", "slack", "offset", "yields_at", "creep") if np.any(getattr(self, name))]
         if math.isinf(self.stiffness) and given:
             raise SceneError(
-                f"attachments.{given[0]} of a weld: only a spring has one; give a stiffness in N/m or leave it out."
+                f"attachments.{given[0]} of a weld: only a spring has one; give a stiffness in N/m or remove the key."
             )
 
     @property
     def law(self) -> tuple[float | tuple[float, float, float], ...]:
-        """How it holds a vertex: all that does not say where."""
+        """Return all values but the geometry."""
         return tuple(getattr(self, f.name) for f in fields(Attachment))
 
     @property
     def half_width(self) -> float:
-        """Vertices up to this distance from the shape are attached [m]."""
+        """Return the distance from the shape up to which vertices are attached [m]."""
         return 0.5 * getattr(self, "width")  # noqa: B009  # each shape has one, with a range of its own
 
     @abstractmethod
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """From points in tissue coordinates to the shape [m]."""
+        """Return the distance of points in tissue coordinates from the shape [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +85,7 @@ class Segment(Attachment):
     width: float = number(unit="m", above=0, at_most=1)
 
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """From points to the segment [m]."""
+        """Return the distance of points from the segment [m]."""
         return distance_to_segment(p, np.array(self.start), np.array(self.end))
 
 
@@ -97,7 +100,7 @@ class Arc(Attachment):
     width: float = number(unit="m", above=0, at_most=1)
 
     def __post_init__(self) -> None:
-        """Check the angles."""
+        """Check that the arc runs counter-clockwise by at most a full turn."""
         super().__post_init__()
         if not 0 < self.end_deg - self.start_deg <= 360:
             raise SceneError(
@@ -105,15 +108,15 @@ class Arc(Attachment):
             )
 
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """From points to the arc [m]."""
+        """Return the distance of points from the arc [m]."""
         start, end = math.radians(self.start_deg), math.radians(self.end_deg)
         offset = p - np.array(self.centre)
         angle = np.arctan2(offset[:, 1], offset[:, 0])
-        beside = (angle - start) % (2 * math.pi) <= end - start
+        within_angle = (angle - start) % (2 * math.pi) <= end - start
         to_circle = np.abs(np.linalg.norm(offset, axis=1) - self.radius)
         tips = self.radius * np.array([[math.cos(a), math.sin(a)] for a in (start, end)])
         to_tips = np.linalg.norm(offset[:, None] - tips, axis=2).min(axis=1)
-        return np.where(beside, to_circle, to_tips)
+        return np.where(within_angle, to_circle, to_tips)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +128,7 @@ class Disc(Attachment):
     width: float = number(0.0, unit="m", at_least=0, at_most=1)
 
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """From points to the disc [m]; 0 inside."""
+        """Return the distance of points from the disc [m]; 0 inside."""
         return np.maximum(np.linalg.norm(p - np.array(self.centre), axis=1) - self.radius, 0.0)
 
 
@@ -145,7 +148,7 @@ class Polygon(Attachment):
                 raise SceneError(f"attachments.points: the sides after point {i} and point {j} cross; reorder them.")
 
     def distance(self, p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """From points to the polygon [m]; 0 inside, by the even-odd rule."""
+        """Return the distance of points from the polygon [m]; 0 inside, by the even-odd rule."""
         corners = np.array(self.points)
         outline = np.full(len(p), np.inf)
         inside = np.zeros(len(p), dtype=bool)
@@ -159,38 +162,46 @@ class Polygon(Attachment):
 
 
 SHAPES: dict[str, type[Attachment]] = {"segment": Segment, "arc": Arc, "disc": Disc, "polygon": Polygon}
+"""Class of each value of the key `shape`."""
 
 
 def owners(attachments: tuple[Attachment, ...], vertices: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Which of the attachments holds each vertex; -1 where it is free.
+    """Return the index of the attachment that holds each vertex [m]; -1 where it is free.
 
     Raises:
-        SceneError: a shape holds no vertex, or two shapes disagree about one.
+        SceneError: a shape holds no vertex, or two shapes contradict each other at one.
     """
     owner = np.full(len(vertices), -1)
-    for number_, shape in enumerate(attachments):
+    for index, shape in enumerate(attachments):
         inside = shape.distance(vertices) <= shape.half_width
         if not inside.any():
             raise SceneError(
-                f"attachments[{number_}] ({type(shape).__name__.lower()}) holds no vertex of the tissue: "
+                f"attachments[{index}] ({type(shape).__name__.lower()}) holds no vertex of the tissue: "
                 "move it onto the sheet or widen it."
             )
         for vertex in np.flatnonzero(inside & (owner >= 0)):
-            _agree(attachments, int(owner[vertex]), number_, vertices[vertex])
-        owner[inside] = number_
+            _refuse_contradiction(attachments, int(owner[vertex]), index, vertices[vertex])
+        owner[inside] = index
     return owner
 
 
-def _agree(attachments: tuple[Attachment, ...], one: int, other: int, place: Float[np.ndarray, " 2"]) -> None:
-    for f, a, b in zip(fields(Attachment), attachments[one].law, attachments[other].law, strict=True):
+def _refuse_contradiction(
+    attachments: tuple[Attachment, ...], first: int, second: int, vertex: Float[np.ndarray, " 2"]
+) -> None:
+    for f, a, b in zip(fields(Attachment), attachments[first].law, attachments[second].law, strict=True):
         if a != b:
             held = ["a weld" if value == math.inf else f"{f.name} = {value}" for value in (a, b)]
             raise SceneError(
-                f"attachments[{one}] and attachments[{other}] contradict each other at the vertex at "
-                f"({place[0]:.4f}, {place[1]:.4f}) m: {held[0]} and {held[1]}. Make them equal or part them."
+                f"attachments[{first}] and attachments[{second}] contradict each other at the vertex at "
+                f"({vertex[0]:.4f}, {vertex[1]:.4f}) m: {held[0]} and {held[1]}. Make them equal or move them apart."
             )
 
 
-def vertex_stiffness(attachments: tuple[Attachment, ...], owner: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the stiffness that holds each vertex [N/m], by `owners`: 0 where free, infinity where welded."""
-    return np.array([attachments[one].stiffness if one >= 0 else 0.0 for one in owner])
+def vertex_values(
+    attachments: tuple[Attachment, ...], owner: Int[np.ndarray, " n"], key: str, *, free: object = 0.0
+) -> Float[np.ndarray, "n ..."]:
+    """Return the value of one key of `Attachment` at each vertex, by `owners`; `free` where nothing holds it.
+
+    The stiffness [N/m] is infinite where the vertex is welded.
+    """
+    return np.array([getattr(attachments[index], key) if index >= 0 else free for index in owner], dtype=float)

@@ -1,7 +1,8 @@
-"""The grasp programme: still frames, then one point after the other, grasped, lifted, lowered and let go.
+"""The grasp programme: still frames, then each grasp point in turn is grasped, lifted, lowered and released.
 
-A policy that chooses its own pulls begins with a part of it: `still`, or `opening`, with the first point in the jaws.
-The jaws open where they closed: a corner dropped from the top can fold over, and a fold does not undo itself.
+A policy that chooses its own pulls begins with a part of the programme: `still`, or `opening`, which also grasps and
+lifts the first point. The jaws open where they closed: a corner that is dropped from the top can fold over, and a fold
+does not undo itself.
 """
 
 import math
@@ -15,12 +16,14 @@ from jiggle_mj.actions import Action, Grasp, Move, Release, Wait
 
 from .scene import Scene
 
-OPENING = 0.01
-"""Lift with which a single grasp begins [m]."""
+OPENING_HEIGHT = 0.01
+"""Lift of the first grasp in `opening` [m]; low enough that the sheet does not slide."""
+MIN_DISTANCE_FROM_MIDDLE = 1e-9
+"""Distance from the sheet's middle below which a lift has no inward direction [m]; it avoids a division by 0."""
 
 
 def grasp_points(scene: Scene) -> tuple[tuple[float, float], ...]:
-    """The scene's points, or the four corners counter-clockwise from (-, -) [m]."""
+    """Return the scene's grasp points, or the four corners counter-clockwise from (-, -) [m]."""
     if scene.programme.points:
         return scene.programme.points
     x, y = (side / 2 - scene.programme.inset for side in scene.tissue.size)
@@ -28,7 +31,7 @@ def grasp_points(scene: Scene) -> tuple[tuple[float, float], ...]:
 
 
 def programme(scene: Scene) -> Iterator[Action]:
-    """The scene's actions in order; each is one observation."""
+    """Yield the scene's actions in order; each gives one observation."""
     plan = scene.programme
     yield from still(scene)
     for point in grasp_points(scene):
@@ -39,13 +42,13 @@ def programme(scene: Scene) -> Iterator[Action]:
 
 
 def still(scene: Scene) -> Iterator[Action]:
-    """The frames before the first grasp."""
+    """Yield the waits before the first grasp."""
     for _ in range(scene.programme.still_frames):
         yield Wait()
 
 
-def opening(scene: Scene, *, height: float = OPENING) -> Iterator[Action]:
-    """Still frames, and the first point grasped and lifted [m], so that nothing slides."""
+def opening(scene: Scene, *, height: float = OPENING_HEIGHT) -> Iterator[Action]:
+    """Yield the still frames, then the grasp of the first point and its lift by at least `height` [m]."""
     yield from still(scene)
     share = height / scene.programme.height
     yield from islice(_lift(scene, grasp_points(scene)[0]), 1 + math.ceil(share * scene.programme.increments))
@@ -59,8 +62,8 @@ def _lift(scene: Scene, point: tuple[float, float]) -> Iterator[Action]:
 
 
 def _along(scene: Scene, point: tuple[float, float], share: float) -> Float[np.ndarray, " 3"]:
-    """Where the tip is after a share of the lift from a point."""
+    """Return the tip's position after a share of the lift from a point [m]."""
     (x, y), lean = point, math.radians(scene.programme.lean_deg)
-    inward = -np.array([x, y]) / max(math.hypot(x, y), 1e-9)
+    inward = -np.array([x, y]) / max(math.hypot(x, y), MIN_DISTANCE_FROM_MIDDLE)
     direction = np.array([*(math.sin(lean) * inward), math.cos(lean)])
     return np.array([x, y, 2 * scene.tissue.radius]) + direction * scene.programme.height * share

@@ -1,7 +1,10 @@
-"""What a scene file can say: the tree of sections, with units, defaults and ranges.
+"""The sections and keys of a scene, with units, defaults and ranges. Nothing here touches MuJoCo.
 
-Tissue coordinates are the world's x and y in metres, origin in the middle of the sheet, bed at z = 0. Angles are in
-degrees and their names say so. Nothing here touches MuJoCo.
+Tissue coordinates are the world's x and y in metres, with the origin in the middle of the sheet and the bed at z = 0.
+Angles are in degrees and their names say so.
+
+The path of a key: `scene_file.py` reads it from TOML into the section below that has its name; `tissue/model.py` writes
+it into MuJoCo's specification (its docstring lists which function writes which section).
 """
 
 import math
@@ -17,8 +20,8 @@ from .attachments import Attachment
 from .disturbance import Disturbance
 from .section import Section, choice, integer, number, points, switch, vector
 
-MOST = 20_000
-"""Vertices of a sheet."""
+MAX_VERTICES = 20_000
+"""Largest number of vertices of a sheet; 30 times a shipped scene's, so that a spacing in a wrong unit is refused."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,19 +38,19 @@ class TissueConfig(Section):
     density: float = number(1000.0, unit="kg/m^3", above=0, at_most=1e5)
     """Mass per volume [kg/m^3]."""
     damping: float = number(0.01, unit="s", at_least=0, at_most=10)
-    """Rayleigh damping: viscous stress per elastic stress rate [s]."""
+    """Rayleigh damping: viscous stress over the rate of elastic stress [s]."""
     mesh: str = choice("unstructured", among=("equilateral", "unstructured"))
     spacing: float = number(4.5e-3, unit="m", above=0, at_most=0.05)
-    """Edge length aimed at [m]."""
+    """Intended edge length [m]."""
     seed: int = integer(0, at_least=0, at_most=2**32 - 1)
-    """Draws the unstructured mesh."""
+    """Seed of the unstructured mesh."""
     radius: float = number(2e-4, unit="m", above=0, at_most=5e-3)
-    """Half the thickness that contact and drawing give the sheet [m]."""
+    """Half the thickness of the sheet in contact and in images [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BedConfig(Section):
-    """The plane that the tissue lies on."""
+    """The plane under the tissue."""
 
     section: ClassVar[str] = "bed"
     present: bool = switch(True)
@@ -57,102 +60,106 @@ class BedConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class TweezerConfig(Section):
-    """The tool."""
+    """The tool that grasps the tissue."""
 
     section: ClassVar[str] = "tweezer"
     radius: float = number(7e-3, unit="m", above=0, at_most=0.05)
     """Vertices within this distance of the tip are held when the jaws close [m]."""
     speed: float = number(0.15, unit="m/s", above=0, at_most=1)
-    """Of the tip while it holds tissue [m/s]."""
+    """Speed of the tip while it holds tissue [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProgrammeConfig(Section):
-    """Grasps and lifts, one point after the other."""
+    """The sequence of grasps and lifts, and the policy that may replace it."""
 
     section: ClassVar[str] = "programme"
     policy: str = choice("corners", among=POLICIES)
-    """Who chooses the pulls in `run`, if nothing else is said; `corners` are the grasps below."""
+    """Policy of `run` without `--policy`; `corners` takes the grasps below."""
     still_frames: int = integer(20, at_least=1, at_most=1000)
-    """Frames before the first grasp, from which noise can be learned."""
+    """Number of frames before the first grasp, from which noise can be learned."""
     points: tuple[tuple[float, float], ...] = points((), at_least=0)
-    """Where to grasp, tissue coordinates [m]; empty means the four corners."""
+    """Grasp points in tissue coordinates [m]; empty means the four corners."""
     inset: float = number(3e-3, unit="m", at_least=0, at_most=0.05)
-    """How far inside its two edges a corner is grasped [m]."""
+    """Distance of a corner's grasp point from the two edges [m]."""
     height: float = number(0.042, unit="m", above=0, at_most=0.5)
     """Length of the lift [m]."""
     increments: int = integer(8, at_least=1, at_most=1000)
+    """Number of moves of a lift, one observation each."""
     lean_deg: float = number(8.0, unit="degrees", at_least=-80, at_most=80)
     """Direction of the lift: 0 is straight up, positive leans towards the middle of the sheet."""
     lowering: int = integer(1, at_least=0, at_most=1000)
-    """Increments back to the grasp point before the jaws open; 0 opens them at the top."""
+    """Number of moves back to the grasp point before the jaws open; 0 opens them at the top."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProcedureConfig(Section):
-    """How cuts and sutures turn out."""
+    """Success and properties of cuts and sutures."""
 
     section: ClassVar[str] = "procedure"
     cut_fails: float = number(0.0, at_least=0, at_most=1)
-    """Chance that a cut leaves everything as it was."""
+    """Probability that a cut changes nothing."""
     suture_fails: float = number(0.0, at_least=0, at_most=1)
-    """Chance that a suture does not hold."""
+    """Probability that a suture does not hold."""
     suture_slack: float = number(0.0, unit="m", at_least=0, at_most=0.05)
-    """Length up to which the thread is loose."""
+    """Length up to which the thread is loose [m]."""
     suture_length: float = number(0.03, unit="m", above=0, at_most=1)
-    """Of what the policy `suture` sews [m]."""
+    """Length of the line that the policy `suture` sews [m]."""
     suture_width: float = number(7e-3, unit="m", above=0, at_most=1)
-    """Of the band that it sews [m]."""
+    """Width of the band that it sews [m]."""
     suture_stiffness: float = number(1.0, unit="N/m", above=0, at_most=1e6)
-    """Of each vertex that it sews [N/m]."""
+    """Stiffness of each vertex that it sews [N/m]."""
     suture_offset: tuple[float, float, float] = vector((0.0, 0.0, 0.0), length=3, unit="m")
-    """Where a suture ends, from where its vertex lies at rest; world [m]."""
+    """Anchor of a suture minus the rest position of its vertex, world [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LimitsConfig(Section):
-    """What a policy may ask of the attachments, and where it may take the tip."""
+    """Limits on attachment loads and on the tip, which the policies keep."""
 
     section: ClassVar[str] = "limits"
     energy: float = number(1e-7, unit="J", above=0, at_most=1)
-    """Mean over all particles of the energy in their attachments [J]."""
+    """Largest energy in the attachments, as the mean over all vertices [J]."""
     force: float = number(1e-2, unit="N", above=0, at_most=1e3)
-    """On any one attachment [N]."""
+    """Largest force on any one attachment [N]."""
     chance: float = number(0.01, above=0, below=0.5)
-    """Largest probability with which a planned step may exceed one of the two."""
+    """Largest probability that a planned step exceeds one of the two."""
     unknown: float = number(1.0, unit="N/m", above=0, at_most=1e6)
-    """Stiffness of attachments that nobody knows of yet, as a plan reckons with them [N/m]."""
+    """Stiffness that a plan assumes for attachments not found yet [N/m]."""
     ceiling: float = number(0.06, unit="m", above=0, at_most=1)
-    """Greatest height of the tip above the bed [m]."""
+    """Largest height of the tip above the bed [m]."""
     beside: float = number(0.01, unit="m", above=0, at_most=1)
-    """How far beyond the resting sheet's extent the tip may go sideways [m]."""
+    """Largest horizontal distance of the tip beyond the resting sheet's extent [m]."""
 
     def limits(self) -> limits.Limits:
-        """In the shared vocabulary."""
-        return limits.Limits(**{one.name: getattr(self, one.name) for one in fields(self)})
+        """Return the limits in the vocabulary that the policies share."""
+        return limits.Limits(**{f.name: getattr(self, f.name) for f in fields(self)})
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraConfig(Section):
-    """The stereo pair, looking at a point from a distance, tilted about the world's x axis."""
+    """The stereo pair, which looks at a point from a distance and is tilted about the world's x axis."""
 
     section: ClassVar[str] = "camera"
     width: int = integer(640, at_least=16, at_most=4096)
+    """Image width [px]."""
     height: int = integer(480, at_least=16, at_most=4096)
+    """Image height [px]."""
     baseline: float = number(5e-3, unit="m", above=0, at_most=0.5)
+    """Distance between the two cameras [m]."""
     distance: float = number(0.14, unit="m", above=0, at_most=5)
-    """From the pair's middle to the target [m]."""
+    """Distance from the pair's middle to the target [m]."""
     target: tuple[float, float, float] = vector((0.0, 0.004, 0.01), length=3, unit="m")
-    """What the pair's middle axis passes through, world [m]."""
+    """Point on the pair's middle axis, world [m]."""
     tilt_deg: float = number(15.0, unit="degrees", at_least=-80, at_most=80)
-    """0 looks straight down; positive looks from the side of negative y."""
+    """Tilt [degrees]: 0 looks straight down, positive looks from the side of negative y."""
     fov_deg: float = number(50.0, unit="degrees", above=0, below=170)
-    """Vertical field of view."""
+    """Vertical field of view [degrees]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LightsConfig(Section):
-    """An even light and one lamp beside the camera; intensities in [0, 1]."""
+    """Ambient light and one lamp beside the camera; intensities in [0, 1]."""
 
     section: ClassVar[str] = "lights"
     ambient: float = number(0.45, at_least=0, at_most=1)
@@ -163,37 +170,38 @@ class LightsConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class TextureConfig(Section):
-    """The looks of tissue and bed, drawn from a seed."""
+    """Appearance of tissue and bed, drawn from a seed."""
 
     section: ClassVar[str] = "texture"
     seed: int = integer(0, at_least=0, at_most=2**32 - 1)
     contrast: float = number(1.0, at_least=0, at_most=1.5)
-    """1 is a vessel-rich membrane; 0 is a plain sheet."""
+    """Contrast: 1 is a membrane rich in vessels, 0 is a plain sheet."""
     resolution: int = integer(1024, at_least=64, at_most=4096)
-    """Texture pixels along each side."""
+    """Number of texture pixels along each side."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensingConfig(Section):
-    """Noise of what the estimator is given."""
+    """Number and noise of the measurements."""
 
     section: ClassVar[str] = "sensing"
     point_sd: float = number(2e-4, unit="m", above=0, at_most=0.1)
-    """Standard deviation of each coordinate of a measured point, on its own [m]."""
+    """Standard deviation of the independent noise of each coordinate of a measured point [m]."""
     smooth_sd: float = number(0.0, unit="m", at_least=0, at_most=0.1)
-    """Standard deviation of noise on top of that, which points near to one another share, as a tracker's do [m]."""
+    """Standard deviation of additional noise that neighbouring points share, as those of a tracker do [m]."""
     smooth_length: float = number(0.01, unit="m", above=0, at_most=1)
-    """Distance over the sheet at which that noise correlates by exp(-1/2) [m]."""
+    """Distance over the sheet at which the correlation of that noise is exp(-1/2) [m]."""
     n_points: int = integer(600, at_least=10, at_most=100000)
-    """Tracked material points of `sensing = points`."""
+    """Number of tracked material points with `--sensing points`."""
     cloud_points: int = integer(3000, at_least=10, at_most=100000)
-    """Points of each frame of `sensing = cloud`."""
+    """Number of points in each frame with `--sensing cloud`."""
     image_sd: float = number(2.0, unit="grey levels", at_least=0, at_most=100)
+    """Standard deviation of the noise of each pixel [grey levels]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DeclaredConfig(Section):
-    """What the user tells the estimator before anything is seen. It may differ from the tissue."""
+    """What the estimator is given before the first frame. It may differ from the tissue."""
 
     section: ClassVar[str] = "declared"
     membrane_stiffness: float = number(30.0, unit="N/m", above=0)
@@ -204,7 +212,7 @@ class DeclaredConfig(Section):
     bed: bool = switch(True)
 
     def declaration(self) -> Declaration:
-        """In the shared vocabulary."""
+        """Return the declaration in the vocabulary that the estimator shares."""
         return Declaration(
             membrane_stiffness=self.membrane_stiffness,
             poisson=self.poisson,
@@ -217,18 +225,18 @@ class DeclaredConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """One scene. A tissue without attachments is allowed."""
+    """One scene: every section, checked. A tissue without attachments is allowed."""
 
     name: str
     seed: int = 0
-    """With the seed of a run it draws the sensing noise, so that two scenes never share theirs."""
+    """Seed of the sensing noise, together with the seed of a run; two scenes with two seeds never share noise."""
     tissue: TissueConfig = field(default_factory=TissueConfig)
     bed: BedConfig = field(default_factory=BedConfig)
     attachments: tuple[Attachment, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
-    """What nobody tells the estimator of, in the order in which they begin."""
+    """What happens without the estimator being informed; those that start together begin in this order."""
     secret: bool = False
-    """Whether nothing but the truth file may say that there are disturbances."""
+    """Whether the truth file alone says that there are disturbances."""
     tweezer: TweezerConfig = field(default_factory=TweezerConfig)
     programme: ProgrammeConfig = field(default_factory=ProgrammeConfig)
     procedure: ProcedureConfig = field(default_factory=ProcedureConfig)
@@ -240,17 +248,17 @@ class Scene:
     declared: DeclaredConfig = field(default_factory=DeclaredConfig)
 
     def __post_init__(self) -> None:
-        """Check what spans several sections."""
+        """Check the relations between sections."""
         if self.tissue.spacing > min(self.tissue.size) / 4:
             raise SceneError(
                 f"tissue.spacing = {self.tissue.spacing}: must be at most a quarter of the shorter side, "
                 f"{min(self.tissue.size) / 4:g} m."
             )
         n = self.tissue.size[0] * self.tissue.size[1] / (math.sqrt(0.75) * self.tissue.spacing**2)
-        if n > MOST:
+        if n > MAX_VERTICES:
             raise SceneError(
                 f"tissue.spacing = {self.tissue.spacing} m on {self.tissue.size[0]:g} by {self.tissue.size[1]:g} m "
-                f"makes about {n:.3g} vertices; at most {MOST} are allowed. Raise spacing or make the sheet smaller."
+                f"makes about {n:.3g} vertices; at most {MAX_VERTICES} are allowed. Raise spacing or shrink the sheet."
             )
         for disturbance in self.disturbances:
             disturbance.check(self.tissue.size)

@@ -1,4 +1,4 @@
-"""Checked fields of a scene: every key has a type and an allowed range, in TOML and in Python alike.
+"""Checked fields of a scene: every key has a type and a range, in TOML and in Python alike.
 
 A `Section` is a frozen dataclass whose fields are made by `number`, `integer`, `switch`, `choice`, `vector` and
 `points`; construction checks them and raises a `SceneError` that names the key, the value and what is allowed.
@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 from jiggle_mj.errors import SceneError
 
 Check = Callable[[object], Any]
-"""Returns the value in its stored type, or raises ValueError with what is allowed."""
+"""Function that returns the value in its stored type, or raises ValueError with what is allowed."""
 
 
 def _real(value: object, allowed: str) -> float:
@@ -40,7 +40,7 @@ def number(
     at_most: float | None = None,
     below: float | None = None,
 ) -> Any:
-    """A finite number in an interval; without a default the key is required."""
+    """Return a field for a finite number in an interval; without a default the key is required."""
     allowed = f"a number in {_interval(above, at_least, at_most, below)}{f' {unit}' if unit else ''}"
 
     def check(value: object) -> float:
@@ -59,7 +59,7 @@ def number(
 
 
 def integer(default: int | object = MISSING, *, at_least: int, at_most: int) -> Any:
-    """A whole number in an interval."""
+    """Return a field for a whole number in an interval."""
     allowed = f"a whole number in [{at_least}, {at_most}]"
 
     def check(value: object) -> int:
@@ -71,7 +71,7 @@ def integer(default: int | object = MISSING, *, at_least: int, at_most: int) -> 
 
 
 def switch(default: bool | object = MISSING) -> Any:
-    """True or false."""
+    """Return a field for true or false."""
 
     def check(value: object) -> bool:
         if not isinstance(value, bool):
@@ -82,7 +82,7 @@ def switch(default: bool | object = MISSING) -> Any:
 
 
 def choice(default: str | object = MISSING, *, among: tuple[str, ...]) -> Any:
-    """One of a few words."""
+    """Return a field for one of the words `among`."""
 
     def check(value: object) -> str:
         if not isinstance(value, str) or value not in among:
@@ -101,7 +101,7 @@ def vector(
     at_most: float = math.inf,
     direction: bool = False,
 ) -> Any:
-    """A list of `length` finite numbers, each within bounds where they are given; not all 0 if it is a direction."""
+    """Return a field for `length` finite numbers within the bounds given; not all 0 if they are a direction."""
     bound = f" in {_interval(above, None, at_most, None)}" if math.isfinite(above) or math.isfinite(at_most) else ""
     allowed = f"a list of {length} numbers{bound}{f' {unit}' if unit else ''}{', not all 0' if direction else ''}"
 
@@ -117,7 +117,7 @@ def vector(
 
 
 def points(default: tuple[tuple[float, float], ...] | object = MISSING, *, at_least: int) -> Any:
-    """A list of points x, y."""
+    """Return a field for a list of points [x, y] in m."""
     allowed = f"a list of at least {at_least} points [x, y] in m"
 
     def check(value: object) -> tuple[tuple[float, ...], ...]:
@@ -131,7 +131,7 @@ def points(default: tuple[tuple[float, float], ...] | object = MISSING, *, at_le
 
 
 def stiffness() -> Any:
-    """A spring constant per vertex, or a weld, which is stored as infinity."""
+    """Return a field for a spring constant per vertex [N/m], or a weld, which is stored as infinity."""
     allowed = "a number above 0 in N/m per vertex, or 'weld'"
 
     def check(value: object) -> float:
@@ -147,13 +147,14 @@ def stiffness() -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """One table of a scene file.
+    """One table of a scene file, checked when it is built.
 
     Raises:
         SceneError: a value has the wrong type or is out of its range.
     """
 
     section: ClassVar[str]
+    """Name of the table; error messages begin with it."""
 
     def __post_init__(self) -> None:
         """Check every field and store it in its type."""
@@ -162,7 +163,7 @@ class Section:
 
 
 def checked(f: Field[Any], value: object, *, where: str) -> Any:
-    """The value of one field in its stored type.
+    """Return the value of one field in its stored type.
 
     Raises:
         SceneError: it has the wrong type or is out of its range.

@@ -1,1 +1,1 @@
-"""What is seen and reported of the tissue: stereo images, points and the tool."""
+"""Observations of the simulation: stereo images, measured points and the tool's reports."""

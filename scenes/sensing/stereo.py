@@ -1,4 +1,4 @@
-"""Offscreen images of the stereo pair."""
+"""Offscreen rendering of the stereo pair."""
 
 import math
 
@@ -12,12 +12,12 @@ from jiggle_mj.observation import StereoPair
 
 from ..opengl import IMPORT_ERROR, no_opengl
 from ..scene.scene import CameraConfig
-from ..tissue.cameras import NAMES
+from ..tissue.cameras import CAMERA_NAMES
 from .highlights import with_highlights
 
 
 class StereoRenderer:
-    """Offscreen images of both cameras; close it when done, or use it in a `with` block.
+    """Renderer of both cameras; call `close` when done.
 
     Raises:
         RenderError: this machine has no offscreen OpenGL.
@@ -25,7 +25,7 @@ class StereoRenderer:
 
     def __init__(self, model: mujoco.MjModel, camera: CameraConfig, *, gloss: float = 0.0) -> None:
         self.gloss = gloss
-        """Strength of the lamp's highlights on the tissue, from 0 to 1."""
+        """Strength of the lamp's highlights on the tissue, in [0, 1]."""
         self._model = model
         if IMPORT_ERROR is not None:
             raise RenderError(no_opengl(IMPORT_ERROR))
@@ -37,8 +37,8 @@ class StereoRenderer:
             self._renderer.scene.flags[flag] = 0
 
     def render(self, data: mujoco.MjData) -> StereoPair:
-        """One noise-free image from each camera."""
-        left, right = (self._image(data, name) for name in NAMES)
+        """Return one noise-free image from each camera."""
+        left, right = (self._image(data, name) for name in CAMERA_NAMES)
         return StereoPair(left=left, right=right)
 
     def _image(self, data: mujoco.MjData, name: str) -> UInt8[np.ndarray, "height width 3"]:

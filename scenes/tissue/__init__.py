@@ -1,1 +1,1 @@
-"""The tissue in MuJoCo: the compiled model, springs and welds, the jaws, and its motion."""
+"""The tissue in MuJoCo: the compiled model, springs and welds, the jaws, and the simulation."""

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 
 
 def constraint_force(data: mujoco.MjData, equalities: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m 3"]:
-    """What each `connect` pulls with [N]; zero where it is inactive."""
+    """Return the force of each `connect` constraint, world [N]; zero where it is inactive."""
     rows = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
     force = np.zeros((data.eq_active.size, 3))
     ids, first = np.unique(data.efc_id[rows], return_index=True)

@@ -1,6 +1,6 @@
-"""Cutting attachments and sewing new ones: on a region of the sheet, with a chance that it does not succeed.
+"""Cuts and sutures: they remove or add attachments in a region of the sheet, and may fail at random.
 
-The region is in tissue coordinates, that of the sheet at rest. Whether it succeeded is written into the truth alone.
+The region is in tissue coordinates, those of the sheet at rest. Only the truth file says whether an event succeeded.
 """
 
 import numpy as np
@@ -13,22 +13,22 @@ from jiggle_mj.regions import distance_to_path
 from .simulation import Simulation
 
 
-def carry_out(event: Cut | Suture, simulation: Simulation, rng: np.random.Generator) -> dict[str, object]:
-    """Cut or sew, if chance allows it.
+def apply_event(event: Cut | Suture, simulation: Simulation, rng: np.random.Generator) -> dict[str, object]:
+    """Apply a cut or a suture, which fails with the probability that the scene's [procedure] states.
 
     Returns:
-        For the truth: what was intended, how many vertices the region holds and how many of them were attached
-        before, and whether it succeeded.
+        The event for the truth file: what was intended, how many vertices the region holds, how many of them were
+        attached before, and whether it succeeded.
 
     Raises:
-        ActionError: a region that meets no tissue, or numbers that are none.
+        ActionError: the region meets no tissue, or a number is not finite or not above 0.
     """
     name = type(event).__name__
     region = _region(event, simulation.tissue.sheet.vertices, name)
     settings, anchors = simulation.scene.procedure, simulation.anchors
-    attached = int((anchors.stiffness[region] > 0).sum())
-    fails = settings.cut_fails if isinstance(event, Cut) else settings.suture_fails
-    succeeded = bool(rng.random() >= fails)
+    n_attached = int((anchors.stiffness[region] > 0).sum())
+    failure_probability = settings.cut_fails if isinstance(event, Cut) else settings.suture_fails
+    succeeded = bool(rng.random() >= failure_probability)
     if succeeded and isinstance(event, Suture):
         offset = np.array(settings.suture_offset)
         anchors.sew(region, stiffness=event.stiffness, offset=offset, slack=settings.suture_slack)
@@ -39,12 +39,13 @@ def carry_out(event: Cut | Suture, simulation: Simulation, rng: np.random.Genera
         "path": np.asarray(event.path, float).tolist(),
         "width": float(event.width),
         "n_vertices": int(region.sum()),
-        "n_attached": attached,
+        "n_attached": n_attached,
         "succeeded": succeeded,
     }
 
 
 def _region(event: Cut | Suture, vertices: Float[np.ndarray, "n 2"], name: str) -> Bool[np.ndarray, " n"]:
+    """Return which vertices lie within half the event's width of its path."""
     path = np.array(event.path, dtype=float)
     if path.ndim != 2 or path.shape[1] != 2 or not len(path) or not np.isfinite(path).all():
         raise ActionError(f"{name}.path must be one or more finite points [x, y] in m; got {event.path}.")

@@ -1,4 +1,4 @@
-"""Scene files: what is read, what is refused, and what the refusal says."""
+"""Scene files: the shipped ones, reading and writing, and the messages of refusals."""
 
 import math
 from dataclasses import replace
@@ -26,21 +26,21 @@ def attached_vertices(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 STIFFNESSES = {"arc_soft": 0.003, "arc": 1 / 30, "arc_stiff": 1.0, "arc_weld": np.inf}
-"""Of an attached vertex, as a share of the membrane stiffness."""
+"""Stiffness of an attached vertex over the membrane stiffness."""
 
 
 PROCEDURES = {"detach": "large_attach", "suture": "line"}
-"""Scenes that a policy works on, and what they are otherwise."""
+"""Scenes for the policy of the same name, and the scenes that they are copies of."""
 
 
-def test_the_shipped_scenes_are_the_twelve_promised():
+def test_the_shipped_scenes_are_complete():
     assert set(shipped_scenes()) == {*PAPER_COUNTS, *STIFFNESSES, *PROCEDURES, "large_attach", "free"}
 
 
 @pytest.mark.parametrize("name", sorted(PROCEDURES))
 def test_the_scenes_of_procedures_differ_in_their_policy_alone(name):
-    other = load_scene(PROCEDURES[name])
-    assert load_scene(name) == replace(other, name=name, programme=replace(other.programme, policy=name))
+    original = load_scene(PROCEDURES[name])
+    assert load_scene(name) == replace(original, name=name, programme=replace(original.programme, policy=name))
 
 
 @pytest.mark.parametrize("name", sorted(STIFFNESSES))

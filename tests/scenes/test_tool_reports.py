@@ -1,4 +1,4 @@
-"""What the tool says between frames: often, of its own clock, and as late as in the frames themselves."""
+"""The tool's reports between frames: periodic, with times of their own, and as late as the pose in the frames."""
 
 from itertools import pairwise
 
@@ -7,33 +7,35 @@ import numpy as np
 from jiggle_mj.observation import Observation
 from jiggle_mj.scenes import Reference, load_scene, programme
 from jiggle_mj.scenes.disturbances.registry import disturbed
-from jiggle_mj.scenes.sensing.observer import REPORTED
+from jiggle_mj.scenes.sensing.observer import REPORT_PERIOD
 
-LATE = 0.2
+LATENCY = 0.2
+"""Of the late tool [s]."""
 
 
-def test_reports_come_as_often_as_is_said_and_late_where_the_tool_is():
+def test_reports_are_periodic_and_as_late_as_the_tool():
+    """A late report holds the position of a latency before; it is compared where that lies within the first grasp."""
     scene = load_scene("line")
-    prompt, late = seen(scene), seen(disturbed(scene, [f"tool_latency={LATE}"]))
+    prompt, late = observed(scene), observed(disturbed(scene, [f"tool_latency={LATENCY}"]))
     for observations in (prompt, late):
-        times = np.array([report.time for one in observations for report in one.reports])
-        assert np.diff(times).min() >= REPORTED * 1e9 - 1
-        for before, one in pairwise(observations):
-            assert all(before.time < report.time < one.time for report in one.reports)
-    was = {report.time: report.position for one in prompt for report in one.reports}
-    was |= {one.time: one.tool.position for one in prompt}
-    grasp = [one for one in late if one.tool.closed and one.tool.grasp == 1]
+        times = np.array([report.time for observation in observations for report in observation.reports])
+        assert np.diff(times).min() >= REPORT_PERIOD * 1e9 - 1
+        for previous, current in pairwise(observations):
+            assert all(previous.time < report.time < current.time for report in current.reports)
+    true = {report.time: report.position for observation in prompt for report in observation.reports}
+    true |= {observation.time: observation.tool.position for observation in prompt}
+    grasp = [observation for observation in late if observation.tool.closed and observation.tool.grasp == 1]
     compared = [
-        (report.position, was[report.time - round(1e9 * LATE)])
-        for one in grasp
-        for report in one.reports
-        if report.time - round(1e9 * LATE) in was and report.time - 1e9 * LATE > grasp[0].time
+        (report.position, true[report.time - round(1e9 * LATENCY)])
+        for observation in grasp
+        for report in observation.reports
+        if report.time - round(1e9 * LATENCY) in true and report.time - 1e9 * LATENCY > grasp[0].time
     ]
-    told, then = (np.array(part) for part in zip(*compared, strict=True))
-    assert len(told) > 3 and np.ptp(told[:, 2]) > 5e-3
-    np.testing.assert_allclose(told, then, atol=1e-12)
+    reported, expected = (np.array(column) for column in zip(*compared, strict=True))
+    assert len(reported) > 3 and np.ptp(reported[:, 2]) > 5e-3  # over a part of the lift of 42 mm
+    np.testing.assert_allclose(reported, expected, atol=1e-12)  # rounding
 
 
-def seen(scene) -> list[Observation]:
+def observed(scene) -> list[Observation]:
     with Reference(scene, seed=0, sensing="particles") as reference:
         return [reference.step(action) for action, _ in zip(programme(scene), range(30), strict=False)]

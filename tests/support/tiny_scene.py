@@ -1,4 +1,4 @@
-"""A scene of 60 mm and about 90 vertices, and the command line called in this process."""
+"""A scene file of a sheet of 60 mm with about 90 vertices, and calls of the command line in this process."""
 
 import sys
 from pathlib import Path
@@ -30,16 +30,17 @@ increments = 3
 
 
 def scene_file(folder: Path, *, name: str = "tiny", text: str = SCENE) -> Path:
+    """Write a scene file into a folder and return its path."""
     path = folder / f"{name}.toml"
     path.write_text(text)
     return path
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """The exit code of `jiggle-mj ARGUMENTS`."""
+    """Run `jiggle-mj ARGUMENTS` in this process and return its exit code."""
     monkeypatch.setattr(sys, "argv", ["jiggle-mj", *map(str, arguments)])
     try:
         main()
-    except SystemExit as leave:
-        return 0 if leave.code is None else int(leave.code)
+    except SystemExit as stopped:
+        return 0 if stopped.code is None else int(stopped.code)
     return 0

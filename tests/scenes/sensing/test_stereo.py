@@ -1,4 +1,4 @@
-"""The stereo pair: where things are drawn against where the calibration says, and what images hold."""
+"""The stereo pair: rendered positions against the calibration, and the contents of images."""
 
 import dataclasses
 import os
@@ -18,10 +18,11 @@ from jiggle_mj.scenes.tissue.cameras import add_cameras, stereo_camera
 from jiggle_mj.scenes.tissue.texture import bed_texture, tissue_texture
 
 MARKER_RADIUS = 2.5e-3
-"""[m]; about nine pixels, so that a centroid averages the edge's sampling out to a few hundredths."""
+"""Radius of the marker [m]: about nine pixels, so that a centroid averages the sampling of its edge to a few
+hundredths of a pixel."""
 OFF_CENTRE = 0.15
-"""[px]: 0.05 for sampling, 0.1 because a ball's outline is an ellipse whose centre lies outside of the projection
-of the ball's centre, by up to f * (R/z)^2 * tan(angle) = 0.1 px at the field's edge."""
+"""Largest error of a centroid [px]: 0.05 for sampling, and 0.1 because a ball's outline is an ellipse whose centre
+differs from the projection of the ball's centre by up to f * (R/z)^2 * tan(angle) = 0.1 px at the field's edge."""
 
 
 @pytest.mark.render
@@ -30,7 +31,7 @@ of the ball's centre, by up to f * (R/z)^2 * tan(angle) = 0.1 px at the field's 
     [CameraConfig(), CameraConfig(tilt_deg=0.0, fov_deg=35.0), CameraConfig(tilt_deg=-30.0, baseline=8e-3, width=500)],
 )
 def test_a_marker_is_drawn_where_the_calibration_projects_it(camera):
-    """Centroid of a small ball = projection of its centre within 0.1 px: left u, v and disparity u_left - u_right."""
+    """The centroid of a small ball is the projection of its centre: left u and v, and disparity u_left - u_right."""
     places = np.array([[x, y, z] for x in (-0.03, 0.0, 0.035) for y in (-0.025, 0.02) for z in (0.0, 0.03)])
     calibration = stereo_camera(camera)
     for place in places:
@@ -63,8 +64,8 @@ def arc() -> Scene:
 
 
 @pytest.mark.render
-def test_the_sheets_corners_project_onto_the_drawn_ones(arc):
-    """Truth is the visible surface: its corners project within 1 px of the reddish blob's corners."""
+def test_the_sheets_corners_project_onto_the_rendered_ones(arc):
+    """Truth is the visible surface: its corners project within 1 px of the corners of the reddish pixels."""
     with Reference(arc, seed=0, sensing="stereo") as reference:
         left = reference.step(Wait()).images.left.astype(int)
         rows, columns = np.nonzero(left[..., 0] > left[..., 2] + 8)
@@ -77,7 +78,11 @@ def test_the_sheets_corners_project_onto_the_drawn_ones(arc):
 
 
 @pytest.mark.render
-def test_the_lifted_sheet_stays_in_view_and_apart_from_bed_and_tool_by_its_colour(arc):
+def test_the_lifted_sheet_stays_in_view_and_its_colour_separates_it_from_bed_and_tool(arc):
+    """99 % of the vertices are in the image, and 95 % of those away from the edge are on reddish pixels.
+
+    The tool hides a few; the sheet fills less than 60 % of the image.
+    """
     with Reference(arc, seed=0, sensing="stereo") as reference:
         for corner in ([-0.047, -0.047, 4e-4], [0.047, 0.047, 4e-4]):
             point = np.array(corner)
@@ -97,10 +102,10 @@ def test_the_lifted_sheet_stays_in_view_and_apart_from_bed_and_tool_by_its_colou
 
 
 @pytest.mark.render
-def test_image_noise_has_the_stated_sd_and_the_same_seed_gives_the_same_image(arc):
-    """Difference of two still frames: variance 2 sd^2, plus 1/6 for rounding twice; clipped channels left out.
+def test_image_noise_has_the_declared_sd_and_the_same_seed_gives_the_same_image(arc):
+    """The difference of two still frames has variance 2 sd^2, plus 1/6 for two roundings, without clipped channels.
 
-    The tissue still creeps by 1 um a frame, which turns over a few pixels on edges: 2 % is left for them.
+    Within 2 %: the tissue still creeps by 1 um per frame, which changes a few pixels on edges.
     """
     noisy = dataclasses.replace(arc, sensing=SensingConfig(image_sd=2.0))
 
@@ -108,15 +113,16 @@ def test_image_noise_has_the_stated_sd_and_the_same_seed_gives_the_same_image(ar
         with Reference(noisy, seed=seed, sensing="stereo") as reference:
             return [reference.step(Wait()).images.left for _ in range(2)]
 
-    first, again, other = frames(5), frames(5), frames(6)
-    assert first[0].tobytes() == again[0].tobytes()
-    assert first[0].tobytes() != other[0].tobytes()
+    first, repeated, another = frames(5), frames(5), frames(6)
+    assert first[0].tobytes() == repeated[0].tobytes()
+    assert first[0].tobytes() != another[0].tobytes()
     a, b = (frame.astype(float) for frame in first)
     unclipped = (a > 15) & (a < 240) & (b > 15) & (b < 240)
     assert np.var((a - b)[unclipped]) == pytest.approx(2 * 2.0**2 + 1 / 6, rel=0.02)
 
 
 def test_textures_come_from_their_seed_and_differ_in_colour():
+    """Tissue is redder than blue by 30 grey levels and more, the bed is bluer than red."""
     tissue, bed = (draw(seed=1, resolution=128, contrast=1.0) for draw in (tissue_texture, bed_texture))
     assert np.array_equal(tissue, tissue_texture(seed=1, resolution=128, contrast=1.0))
     assert not np.array_equal(tissue, tissue_texture(seed=2, resolution=128, contrast=1.0))
@@ -125,8 +131,8 @@ def test_textures_come_from_their_seed_and_differ_in_colour():
     assert tissue_texture(seed=1, resolution=128, contrast=0.0).std(axis=(0, 1)).max() == 0
 
 
-def test_a_machine_without_opengl_still_simulates_and_says_what_to_install(tmp_path):
-    """A broken OpenGL package stands in for missing libraries: particles work, stereo is refused with the remedy."""
+def test_a_machine_without_opengl_still_simulates_and_names_what_to_install(tmp_path):
+    """A broken OpenGL package replaces missing libraries: particles work, stereo is refused with the remedy."""
     (tmp_path / "OpenGL").mkdir()
     (tmp_path / "OpenGL" / "__init__.py").write_text("raise ImportError('libEGL.so.1 not found')\n")
     code = """
@@ -134,8 +140,8 @@ import dataclasses
 from jiggle_mj.errors import RenderError
 from jiggle_mj.actions import Wait
 from jiggle_mj.scenes import Reference, Scene
-from jiggle_mj.scenes.scene.scene import Tissue
-scene = Scene(name="small", tissue=Tissue(size=(0.04, 0.04), spacing=8e-3))
+from jiggle_mj.scenes.scene.scene import TissueConfig
+scene = Scene(name="small", tissue=TissueConfig(size=(0.04, 0.04), spacing=8e-3))
 assert Reference(scene, seed=0, sensing="particles").step(Wait()).points is not None
 try:
     Reference(scene, seed=0, sensing="stereo")

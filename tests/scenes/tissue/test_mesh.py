@@ -1,4 +1,4 @@
-"""The sheet's triangulation, its checks, and which vertices a shape holds."""
+"""The sheet's triangulation and its checks, the shapes of attachments, and tracked points."""
 
 import math
 
@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jiggle_mj.errors import MeshError, SceneError
-from jiggle_mj.scenes.scene.attachments import Arc, Disc, Polygon, Segment, owners, vertex_stiffness
-from jiggle_mj.scenes.sensing.points import material_tracks, vertex_tracks
+from jiggle_mj.scenes.scene.attachments import Arc, Attachment, Disc, Polygon, Segment, owners, vertex_values
+from jiggle_mj.scenes.sensing.points import INSIDE_TOLERANCE, material_tracks, vertex_tracks
 from jiggle_mj.scenes.tissue.mesh import build_sheet, check_sheet, triangle_areas
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -31,7 +31,8 @@ def test_triangles_tile_the_rectangle_whatever_its_size(width, height, kind, see
     assert sheet.vertex_areas().sum() == pytest.approx(width * height, rel=1e-9)
 
 
-def test_edges_are_about_the_spacing_asked_for():
+def test_the_median_edge_is_the_spacing():
+    """Within 10 %: rows and columns are rounded to fit the sheet, and the unstructured mesh is jittered."""
     for kind in ("equilateral", "unstructured"):
         sheet = build_sheet(size=(0.1, 0.1), spacing=4.5e-3, kind=kind, seed=3)
         edges = np.linalg.norm(sheet.vertices[sheet.faces] - sheet.vertices[np.roll(sheet.faces, 1, axis=1)], axis=2)
@@ -73,6 +74,10 @@ def test_two_disconnected_sheets_are_refused():
         check_sheet(vertices, faces)
 
 
+def vertex_stiffness(shapes: tuple[Attachment, ...]) -> np.ndarray:
+    return vertex_values(shapes, owners(shapes, PLACES), "stiffness")
+
+
 PLACES = np.array([[0.0, 0.0], [0.02, 0.0], [0.0, 0.02], [-0.02, 0.0], [0.03, 0.004]])
 
 
@@ -94,29 +99,30 @@ PLACES = np.array([[0.0, 0.0], [0.02, 0.0], [0.0, 0.02], [-0.02, 0.0], [0.03, 0.
         ),
     ],
 )
-def test_distances_to_shapes_are_the_geometers(shape, distances):
+def test_distances_to_shapes_are_geometric(shape, distances):
+    """Up to rounding."""
     assert shape.distance(PLACES) == pytest.approx(np.array(distances), abs=1e-12)
 
 
 def test_shapes_unite_and_free_vertices_stay_free():
     shapes = tuple(Disc(centre=(x, 0.0), radius=0.001, stiffness=k) for x, k in ((0.0, 2.0), (0.02, math.inf)))
-    assert vertex_stiffness(shapes, owners(shapes, PLACES)).tolist() == [2.0, math.inf, 0.0, 0.0, 0.0]
+    assert vertex_stiffness(shapes).tolist() == [2.0, math.inf, 0.0, 0.0, 0.0]
 
 
-def test_shapes_that_disagree_about_a_vertex_are_refused():
-    """The message says in what; a weld and a spring on one vertex are the plainest contradiction."""
-    for one, other, said in (
+def test_shapes_that_contradict_each_other_are_refused():
+    """The message names the value: two stiffnesses, a weld and a spring, two slacks."""
+    for first, second, message in (
         ({"stiffness": 2.0}, {"stiffness": 3.0}, r"stiffness = 2\.0 and stiffness = 3\.0"),
         ({"stiffness": 2.0}, {"stiffness": math.inf}, r"stiffness = 2\.0 and a weld"),
         ({"stiffness": 2.0}, {"stiffness": 2.0, "slack": 1e-3}, r"slack = 0\.0 and slack = 0\.001"),
     ):
-        shapes = tuple(Disc(centre=(0.0, 0.0), radius=0.001, **law) for law in (one, other))
-        with pytest.raises(SceneError, match=rf"attachments\[0\] and attachments\[1\] contradict .*: {said}"):
-            vertex_stiffness(shapes, owners(shapes, PLACES))
+        shapes = tuple(Disc(centre=(0.0, 0.0), radius=0.001, **law) for law in (first, second))
+        with pytest.raises(SceneError, match=rf"attachments\[0\] and attachments\[1\] contradict .*: {message}"):
+            vertex_stiffness(shapes)
 
 
 @pytest.mark.parametrize("key", ["hardening", "slack", "yields_at", "creep"])
-def test_a_weld_has_nothing_of_a_spring(key):
+def test_a_weld_has_no_value_of_a_spring(key):
     with pytest.raises(SceneError, match=rf"attachments\.{key} of a weld"):
         Disc(centre=(0.0, 0.0), radius=0.001, stiffness=math.inf, **{key: 1e-3})
 
@@ -127,7 +133,11 @@ def test_a_shape_off_the_sheet_is_refused():
 
 
 def test_material_points_follow_an_affine_motion_and_are_no_vertices():
-    """Barycentric points obey p' = A p + t exactly when the vertices do."""
+    """Barycentric points obey p' = A p + t, up to rounding, when the vertices do.
+
+    About the number asked for (the sheet's outline cuts the lattice), over 1 mm from vertices in the median, and spread
+    uniformly: the lattice of 600 points has a spacing of 4.4 mm before its jitter.
+    """
     sheet = build_sheet(size=(0.1, 0.1), spacing=5e-3, kind="unstructured", seed=0)
     tracks = material_tracks(sheet, n_points=600, rng=np.random.default_rng(0))
     flat = np.column_stack([sheet.vertices, np.zeros(len(sheet.vertices))])
@@ -135,7 +145,7 @@ def test_material_points_follow_an_affine_motion_and_are_no_vertices():
     A, t = np.random.default_rng(1).standard_normal((3, 3)), np.array([1.0, 2.0, 3.0])
     assert tracks.positions(flat @ A.T + t) == pytest.approx(rest @ A.T + t, abs=1e-12)
     assert 500 <= len(rest) <= 700
-    assert tracks.weights.min() >= -1e-9
+    assert tracks.weights.min() >= -INSIDE_TOLERANCE
     nearest = np.linalg.norm(rest[:, None] - flat, axis=2).min(axis=1)
     assert np.median(nearest) > 1e-3
     spacing = np.sort(np.linalg.norm(rest[:, None] - rest, axis=2), axis=1)[:, 1]
@@ -143,6 +153,7 @@ def test_material_points_follow_an_affine_motion_and_are_no_vertices():
 
 
 def test_particle_tracks_are_every_vertex_once_in_an_order_that_hides_the_mesh():
+    """A random order of 500 vertices has a correlation with the mesh's order of 0 +- 0.045; 0.2 is over 4 of them."""
     sheet = build_sheet(size=(0.1, 0.1), spacing=5e-3, kind="equilateral", seed=0)
     order = vertex_tracks(sheet, rng=np.random.default_rng(0)).corners[:, 0]
     assert sorted(order) == list(range(len(sheet.vertices)))
