@@ -11,8 +11,9 @@ from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.observation import Declaration
 from jiggle_mj.recording.mcap_files import truth_path
-from jiggle_mj.recording.reader import Recording, RecordingWriter
+from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
+from jiggle_mj.recording.writer import RecordingWriter
 from jiggle_mj.scenes import Reference, load_scene, programme
 from tests.support.tiny_scene import scene_file
 
