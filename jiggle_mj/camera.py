@@ -78,7 +78,9 @@ class StereoCamera:
     """
 
     left: CameraCalibration
+    """Calibration of the left camera."""
     right: CameraCalibration
+    """Calibration of the right camera."""
     T_world_camera: Float[np.ndarray, "4 4"]
     """Transform from the left rectified optical frame to the world [m]."""
 

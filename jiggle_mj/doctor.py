@@ -37,7 +37,7 @@ RENDER_LIMIT_S = 10.0
 JAX_LIMIT_S = 60.0
 """Time for a process to import JAX and list its devices [s]; only a driver that hangs takes longer."""
 
-_RENDER = """
+_RENDER_CODE = """
 import mujoco
 model = mujoco.MjModel.from_xml_string(
     '<mujoco><worldbody><light pos="0 0 3"/><geom type="sphere" size="1" rgba="1 0 0 1"/></worldbody></mujoco>')
@@ -53,7 +53,7 @@ if not image[24, 32, 0] > image[24, 32, 2]:
 print(driver)
 """
 
-_JAX = """
+_JAX_CODE = """
 import jax, jax.numpy as jnp
 kinds = [f"{device.platform} ({device.device_kind})" for device in jax.devices()]
 single = jnp.ones(3).sum().dtype
@@ -116,7 +116,7 @@ def render_probe(backend: Backend, *, time_limit: float = RENDER_LIMIT_S) -> Pro
         backend: value of MUJOCO_GL to try.
         time_limit: time after which the process is ended [s].
     """
-    return _run(_RENDER, time_limit=time_limit, MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
+    return _run(_RENDER_CODE, time_limit=time_limit, MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
 
 
 def _run(code: str, *, time_limit: float, **environment: str) -> Probe:
@@ -184,7 +184,7 @@ def release_numbers(text: str) -> tuple[int, ...]:
 
 def check_jax() -> Check:
     """Check that JAX finds a device and computes in float64 on request."""
-    probe = _run(_JAX, time_limit=JAX_LIMIT_S)
+    probe = _run(_JAX_CODE, time_limit=JAX_LIMIT_S)
     return Check(
         name="jax devices",
         ok=probe.ok,
@@ -199,7 +199,7 @@ def check_opengl(probe_backend: Callable[[Backend], Probe] = render_probe) -> li
     Args:
         probe_backend: renders a frame with a driver.
     """
-    probes = {backend: probe_backend(backend) for backend in OPENGL_PACKAGES}
+    probes: dict[Backend, Probe] = {backend: probe_backend(backend) for backend in OPENGL_PACKAGES}
     one_works = any(probe.ok for probe in probes.values())
     return [
         Check(

@@ -1,7 +1,7 @@
 """The loop of an episode: actions move the reference tissue, observations update the estimate, both are written.
 
-`observe` turns actions into observations and records them; `estimate` turns observations into an estimate and records
-it. A recording is another source of observations. Scoring is in `jiggle_mj.eval`.
+`observe` executes actions, and yields and records observations; `estimate` updates an estimator with observations and
+records the estimate. A recording is another source of observations. Scoring is in `jiggle_mj.eval`.
 """
 
 import time
@@ -40,9 +40,13 @@ class Episode:
     """The estimate of a series of observations."""
 
     sheet: Sheet
+    """Particles of the estimator."""
     estimates: tuple[Estimate, ...]
+    """Estimate after each used frame."""
     belief: Belief
+    """Belief after the last frame."""
     detection: Detection
+    """Particles that the final belief reports attached."""
     prior_entropy: float
     """Differential entropy of the belief before the first observation [nat]."""
     n_frames: int

@@ -94,6 +94,7 @@ class Observation:
     time: int
     """Time from the recording's start [ns]."""
     tool: ToolState
+    """State of the tweezer."""
     reports: tuple[ToolReport, ...] = ()
     """Reports of the tool since the observation before, where it reports more often than frames come."""
     images: StereoPair | None = None

@@ -51,6 +51,7 @@ class WorldFrame:
     """Transform of the data to the world: world = rotation @ data [m] + translation."""
 
     rotation: Float[np.ndarray, "3 3"]
+    """Rotation matrix from the data to the world."""
     translation: Float[np.ndarray, " 3"]
     """Origin of the data in the world [m]."""
 

@@ -133,6 +133,7 @@ class EstimateRecording:
     """An estimate read from a file."""
 
     sheet: Sheet
+    """Particles of the estimator."""
     estimates: tuple[Estimate, ...]
     """The estimate after each frame; wall times are 0, as the file has none."""
     belief: Belief | None
@@ -142,6 +143,7 @@ class EstimateRecording:
     skipped: tuple[tuple[int, str], ...]
     """Index and reason of each observation that was not used."""
     metadata: dict[str, str]
+    """Versions, units and the settings of the estimator."""
 
 
 def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False) -> EstimateRecording:

@@ -25,10 +25,15 @@ class MessageGroup:
     stamp: int
     """Time stamp of the frame: that of its image or cloud [ns]."""
     left: Stamped | None = None
+    """Left image."""
     right: Stamped | None = None
+    """Right image."""
     points: Stamped | None = None
+    """Point cloud."""
     pose: Stamped | None = None
+    """Latest tool pose."""
     grasp: Stamped | None = None
+    """Latest state of the jaws."""
 
 
 def group_messages(

@@ -138,7 +138,7 @@ class Recording:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationReader:
-    """Turns the messages of one group into an observation in the world frame."""
+    """Decoder of the messages of one group into an observation in the world frame."""
 
     contents: RecordingContents
     """The file that holds frames, poses and grasps."""

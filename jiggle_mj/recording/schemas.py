@@ -27,6 +27,7 @@ from ..observation import UNTURNED, ToolState
 WORLD = "world"
 """Name of the world frame."""
 CAMERA_FRAMES = {"left": "camera_left_optical", "right": "camera_right_optical"}
+"""Name of each camera's raw optical frame."""
 FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 """zlib level 1: a third of the time of the default for a tenth more bytes; the MCAP chunk is compressed as well."""
 DISTORTION_COEFFICIENTS = (0, 4, 5, 8)
@@ -36,6 +37,7 @@ UNIT_LENGTH = 0.01
 SHOWN_BYTES = 80
 """How much of a malformed message an error shows."""
 NS_PER_S = 1_000_000_000
+"""Nanoseconds in a second."""
 
 
 GRASP_SCHEMA: dict[str, object] = {
@@ -66,6 +68,7 @@ FIELD_TYPES: dict[str, "PackedElementField.NumericType.ValueType"] = {
 }
 """numpy's little-endian types to the types of PointCloud."""
 FIELD_FORMATS = {number: name for name, number in FIELD_TYPES.items()}
+"""The types of PointCloud to numpy's."""
 
 RAW_ENCODINGS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "8UC3": 3, "8UC1": 1}
 """Encodings of RawImage that are read, and their number of channels; 8UC3 is BGR, as Foxglove reads it."""
