@@ -1,7 +1,7 @@
 """jiggle-mj: where a thin tissue is attached, how strongly and how surely, from pulls seen by a stereo camera.
 
-The public names. Each is fetched from its home when it is first used (PEP 562), so `import jiggle_mj` loads neither
-JAX, MuJoCo nor OpenCV. Truth is not among them: only `jiggle_mj.eval` reads it.
+Defines the public names. Each is imported from its module when it is first used (PEP 562), so `import jiggle_mj` loads
+neither JAX, MuJoCo nor OpenCV. Truth is not among them: only `jiggle_mj.eval` reads it.
 """
 
 from importlib import import_module
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from .observation import StereoPair as StereoPair
     from .observation import ToolState as ToolState
     from .recording.reader import Recording as Recording
-    from .recording.reader import RecordingWriter as RecordingWriter
+    from .recording.writer import RecordingWriter as RecordingWriter
     from .series import RecordingSeries as RecordingSeries
     from .series import record_series as record_series
     from .worker_processes import WorkerProcesses as WorkerProcesses
@@ -113,7 +113,7 @@ __all__ = [
     "shipped_scenes",
 ]
 
-_NAMES_OF = {
+_NAMES_OF_MODULE = {
     "actions": ("Action", "Cut", "Grasp", "Move", "Release", "Suture", "Wait"),
     "camera": ("CameraCalibration", "StereoCamera"),
     "errors": (
@@ -137,30 +137,31 @@ _NAMES_OF = {
     "importing.folder": ("import_folder",),
     "material": ("Material",),
     "observation": ("Declaration", "DeclaredMesh", "MeasuredPoints", "Observation", "StereoPair", "ToolState"),
-    "recording.reader": ("Recording", "RecordingWriter"),
+    "recording.reader": ("Recording",),
+    "recording.writer": ("RecordingWriter",),
     "series": ("RecordingSeries", "record_series"),
     "scenes": ("Reference", "Scene", "load_scene", "programme", "shipped_scenes"),
     "worker_processes": ("WorkerProcesses",),
 }
-_HOME = {name: f"{__name__}.{module}" for module, names in _NAMES_OF.items() for name in names}
+_MODULE_OF_NAME = {name: f"{__name__}.{module}" for module, names in _NAMES_OF_MODULE.items() for name in names}
 
 
 def __getattr__(name: str) -> object:
-    """Fetch a public name from its home, once.
+    """Import a public name from its module, once.
 
     Raises:
         AttributeError: no such name.
     """
     if name == "__version__":
-        found: object = version("jiggle-mj")
-    elif name in _HOME:
-        found = getattr(import_module(_HOME[name]), name)
+        value: object = version("jiggle-mj")
+    elif name in _MODULE_OF_NAME:
+        value = getattr(import_module(_MODULE_OF_NAME[name]), name)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = found
-    return found
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:
-    """Also what has not been fetched yet."""
+    """Return all names, those that are not imported yet included."""
     return sorted({*globals(), *__all__})

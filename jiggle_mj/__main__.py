@@ -1,4 +1,4 @@
-"""`python -m jiggle_mj` is `jiggle-mj`."""
+"""Run the command line: `python -m jiggle_mj` is `jiggle-mj`."""
 
 from .cli import main
 

@@ -1,4 +1,4 @@
-"""What is done to the tissue, one action for each observation.
+"""Actions on the tissue, one for each observation.
 
 World frame: z up, SI units.
 """
@@ -14,17 +14,17 @@ class Grasp:
     """Close the jaws at a point."""
 
     point: Float[np.ndarray, " 3"]
-    """World [m]."""
+    """Position of the tip in the world frame [m]."""
     radius: float
-    """[m]."""
+    """Distance from the tip within which tissue is held [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Move:
-    """Move the tip, and settle."""
+    """Move the tip, and let the tissue settle."""
 
     to: Float[np.ndarray, " 3"]
-    """World [m]."""
+    """Target of the tip in the world frame [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,29 +34,29 @@ class Release:
 
 @dataclass(frozen=True, kw_only=True)
 class Wait:
-    """Observe once more without acting: a still frame."""
+    """Do nothing and observe: a still frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cut:
-    """Cut whatever attaches a region of the sheet."""
+    """Cut all attachments of a region of the sheet."""
 
     path: Float[np.ndarray, "m 2"]
-    """Middle line of the region, in the sheet's coordinates at rest [m]; one point for a disc."""
+    """Centre line of the region in the coordinates of the resting sheet [m]; one point for a disc."""
     width: float
-    """Of the region, across the path and around its ends [m]."""
+    """Width of the region, across the path and around its ends [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Suture:
-    """Attach a region of the sheet."""
+    """Attach a region of the sheet to the bed."""
 
     path: Float[np.ndarray, "m 2"]
-    """See `Cut`."""
+    """Centre line of the region, as in `Cut` [m]."""
     width: float
-    """See `Cut`."""
+    """Width of the region, as in `Cut` [m]."""
     stiffness: float
-    """Intended for each particle of the region [N/m]."""
+    """Intended attachment stiffness of each particle of the region [N/m]."""
 
 
 Action = Grasp | Release | Move | Wait | Cut | Suture

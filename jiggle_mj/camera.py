@@ -13,74 +13,76 @@ from scipy.spatial.transform import Rotation
 from .errors import RecordingError
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turns an OpenGL camera frame (y up, looking along -z; MuJoCo's) into an optical one, and back: it is its inverse."""
-
-
+"""Transform from an OpenGL camera frame (y up, looking along -z; MuJoCo's) to an optical one; it is its own inverse."""
 QUATERNION_DECIMALS = 12
-"""Of a rotation as a recording states it, so that what is read can be stated as the same again."""
+"""Decimals of a recorded quaternion: few enough that a rotation that is read is recorded as the same digits again."""
+EQUAL_INTRINSICS = 1e-6
+"""Largest relative and absolute [px] difference of equal rectified intrinsics: a calibration file rounds its digits."""
 
 
-def stated_rotation(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
-    """A rotation as a recording states it: a rounded quaternion wxyz."""
+def rounded_quaternion(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
+    """Return a rotation as a recording holds it: a quaternion wxyz of `QUATERNION_DECIMALS`."""
     return Rotation.from_matrix(R).as_quat(scalar_first=True).round(QUATERNION_DECIMALS)
 
 
-def read_rotation(quat_wxyz: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation that a recording states; its quaternion may be of any length."""
+def matrix_from_quaternion(quat_wxyz: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation matrix of a quaternion, which need not be of unit length."""
     return Rotation.from_quat(quat_wxyz, scalar_first=True).as_matrix()
 
 
 def as_recorded(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """A pose to the bit as a recording gives it back.
+    """Return a pose bit by bit as a recording gives it back.
 
-    Stated and read twice, as a rounded quaternion is of unit length only to its last decimal.
+    The rotation is rounded and read twice, as a rounded quaternion is of unit length only to its last decimal.
     """
-    read = T.copy()
+    recorded = T.copy()
     for _ in range(2):
-        read[:3, :3] = read_rotation(stated_rotation(read[:3, :3]))
-    return read
+        recorded[:3, :3] = matrix_from_quaternion(rounded_quaternion(recorded[:3, :3]))
+    return recorded
 
 
 def optical_from_opengl(T_world_opengl: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Pose of the optical frame of a camera whose OpenGL pose is given, both camera to world."""
+    """Return the pose of a camera's optical frame from that of its OpenGL frame, both camera to world [m]."""
     return T_world_opengl @ OPENCV_FROM_OPENGL
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraCalibration:
-    """One camera of the pair, with the fields of `sensor_msgs/CameraInfo`."""
+    """Calibration of one camera of the pair, with the fields of `sensor_msgs/CameraInfo`."""
 
     width: int
     """Image width [px]."""
     height: int
     """Image height [px]."""
     K: Float[np.ndarray, "3 3"]
-    """Intrinsics of the raw image [px]."""
+    """Intrinsic matrix of the raw image [px]."""
     P: Float[np.ndarray, "3 4"]
-    """Projection of the rectified image [px]; the right camera has P[0, 3] = -fx * baseline [px m]."""
+    """Projection matrix of the rectified image [px]; the right camera has P[0, 3] = -fx * baseline [px m]."""
     D: Float[np.ndarray, " d"] = field(default_factory=lambda: np.zeros(5))
-    """Distortion, OpenCV's `plumb_bob` order; zeros for a rectified image."""
+    """Distortion coefficients in OpenCV's `plumb_bob` order; zeros for a rectified image."""
     R: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
-    """Rectifying rotation."""
+    """Rotation from the raw to the rectified optical frame."""
 
     @property
     def rectified(self) -> bool:
-        """Whether the raw image already is the rectified one."""
+        """Return whether the raw image already is the rectified one."""
         return not self.D.any() and np.allclose(self.R, np.eye(3)) and np.allclose(self.K, self.P[:, :3])
 
 
 @dataclass(frozen=True, kw_only=True)
 class StereoCamera:
-    """Two calibrated cameras and where the left one stands.
+    """Two calibrated cameras and the pose of the left one.
 
     Raises:
         RecordingError: sizes or rectified intrinsics differ, or the right camera's P[0, 3] is not negative (swapped?).
     """
 
     left: CameraCalibration
+    """Calibration of the left camera."""
     right: CameraCalibration
+    """Calibration of the right camera."""
     T_world_camera: Float[np.ndarray, "4 4"]
-    """Left optical frame to world [m]."""
+    """Transform from the left rectified optical frame to the world [m]."""
 
     def __post_init__(self) -> None:
         """Check that the two calibrations belong together."""
@@ -94,7 +96,9 @@ class StereoCamera:
                 f"right camera_info has P[0,3] = {self.right.P[0, 3]:.6g}; it must be -fx*baseline, below zero "
                 "(are the cameras swapped, or is the calibration monocular?)."
             )
-        if self.left.P[0, 3] != 0 or not np.allclose(self.left.P[:, :3], self.right.P[:, :3], rtol=1e-6, atol=1e-6):
+        if self.left.P[0, 3] != 0 or not np.allclose(
+            self.left.P[:, :3], self.right.P[:, :3], rtol=EQUAL_INTRINSICS, atol=EQUAL_INTRINSICS
+        ):
             raise RecordingError(
                 f"the rectified cameras differ: left P = {self.left.P.tolist()}, right P = {self.right.P.tolist()}; "
                 "all but the right P[0,3] must be equal (rectify with OpenCV's CALIB_ZERO_DISPARITY)."
@@ -104,7 +108,15 @@ class StereoCamera:
     def rectified(
         cls, *, width: int, height: int, focal: float, baseline: float, T_world_camera: Float[np.ndarray, "4 4"]
     ) -> "StereoCamera":
-        """An ideal pair with the principal point in the image's centre; focal in px, baseline in m."""
+        """Return an ideal pair whose principal point is the image's centre.
+
+        Args:
+            width: of both images [px].
+            height: of both images [px].
+            focal: focal length [px].
+            baseline: distance between the two centres of projection [m].
+            T_world_camera: left optical frame to world [m].
+        """
         K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
         left, right = np.hstack([K, np.zeros((3, 1))]), np.hstack([K, [[-focal * baseline], [0], [0]]])
         return cls(
@@ -115,21 +127,21 @@ class StereoCamera:
 
     @property
     def focal(self) -> tuple[float, float]:
-        """Rectified focal lengths fx, fy [px]."""
+        """Return the rectified focal lengths fx, fy [px]."""
         return float(self.left.P[0, 0]), float(self.left.P[1, 1])
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Rectified principal point cx, cy [px]."""
+        """Return the rectified principal point cx, cy [px]."""
         return float(self.left.P[0, 2]), float(self.left.P[1, 2])
 
     @property
     def baseline(self) -> float:
-        """Distance between the two centres of projection [m]."""
+        """Return the distance between the two centres of projection [m]."""
         return float(-self.right.P[0, 3] / self.right.P[0, 0])
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """World points [m] to left pixel u, v and disparity [px] (u_left - u_right, positive in front)."""
+        """Return left pixel u, v and disparity u_left - u_right [px] of world points [m]; it is positive in front."""
         T = np.linalg.inv(self.T_world_camera)
         camera = points @ T[:3, :3].T + T[:3, 3]
         (fx, fy), (cx, cy), depth = self.focal, self.centre, camera[..., 2]
@@ -138,14 +150,14 @@ class StereoCamera:
         )
 
     def back_project(self, uvd: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Left pixel u, v and disparity [px] to world points [m]: the inverse of `project`."""
+        """Return the world points [m] of left pixel u, v and disparity [px]: the inverse of `project`."""
         (fx, fy), (cx, cy) = self.focal, self.centre
         depth = fx * self.baseline / uvd[..., 2]
         camera = np.stack([(uvd[..., 0] - cx) * depth / fx, (uvd[..., 1] - cy) * depth / fy, depth], axis=-1)
         return camera @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
 
     def back_projection_jacobian(self, uvd: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-        """Derivative of `back_project` [m/px], for carrying pixel noise into the world."""
+        """Return the derivative of `back_project` [m/px], which propagates pixel noise to the world."""
         (fx, fy), (cx, cy) = self.focal, self.centre
         u, v, d = np.moveaxis(uvd, -1, 0)
         depth, zero = fx * self.baseline / d, np.zeros_like(d)

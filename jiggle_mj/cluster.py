@@ -1,6 +1,6 @@
-"""Other machines as an executor: a Dask scheduler and its workers, started by whoever owns them.
+"""A Dask cluster as an executor; its owner starts the scheduler and the workers.
 
-Dask is the optional extra `cluster`. The workers need this package, of the same version, and the same folders.
+Dask is the optional extra `cluster`. The workers need the same version of this package, and the same folders.
 """
 
 import logging
@@ -12,25 +12,32 @@ from contextlib import contextmanager
 from .errors import ClusterError, OptionError
 
 URL = r"dask://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):(\d{1,5})"
-PATIENCE = "10s"
-"""How long the scheduler may take to answer."""
-WORKERS_WITHIN = 30
-"""Seconds after which there must be a worker."""
+"""Pattern of a scheduler's URL: its host and its port."""
+MAX_PORT = 65535
+"""Largest TCP port."""
+CONNECT_TIMEOUT_S = 10.0
+"""Default time for the scheduler to answer [s], so that a wrong address is reported soon."""
+WORKER_TIMEOUT_S = 30.0
+"""Default time for the first worker to join [s]: workers that are just being started have time to."""
 
 
 @contextmanager
-def cluster(url: str) -> Iterator[Executor]:
-    """Connect to a scheduler; leaving the `with` by an exception cancels what is under way there.
+def cluster(
+    url: str, *, connect_timeout_s: float = CONNECT_TIMEOUT_S, worker_timeout_s: float = WORKER_TIMEOUT_S
+) -> Iterator[Executor]:
+    """Connect to a scheduler and yield an executor; leaving the `with` cancels the calls that have not finished.
 
     Args:
         url: dask://HOST:PORT.
+        connect_timeout_s: how long the scheduler may take to answer [s].
+        worker_timeout_s: how long the first worker may take to join [s].
 
     Raises:
-        OptionError: the URL is none of these.
+        OptionError: the URL has another form.
         ClusterError: Dask is not installed, no scheduler answers, or it has no workers.
     """
-    place = re.fullmatch(URL, url)
-    if place is None or int(place[2]) > 65535:
+    address = re.fullmatch(URL, url)
+    if address is None or int(address[2]) > MAX_PORT:
         raise OptionError(f"executor = {url!r}: must be dask://HOST:PORT, as in dask://10.0.0.5:8786.")
     try:
         from distributed import Client  # pyright: ignore[reportMissingImports]  # an extra
@@ -39,7 +46,7 @@ def cluster(url: str) -> Iterator[Executor]:
             f"{url} needs Dask, which is not installed ({failure}): pip install 'jiggle-mj[cluster]'."
         ) from failure
     try:
-        client = Client(f"tcp://{place[1]}:{place[2]}", timeout=PATIENCE, set_as_default=False)
+        client = Client(f"tcp://{address[1]}:{address[2]}", timeout=connect_timeout_s, set_as_default=False)
     except (OSError, ValueError) as failure:
         raise ClusterError(
             f"no Dask scheduler answers at {url} ({failure}). Start one with 'dask scheduler', and workers with "
@@ -48,7 +55,7 @@ def cluster(url: str) -> Iterator[Executor]:
     with client:
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # each lost call is reported by its seed
         try:
-            client.wait_for_workers(1, timeout=WORKERS_WITHIN)
+            client.wait_for_workers(1, timeout=worker_timeout_s)
         except TimeoutError as failure:
             raise ClusterError(
                 f"the scheduler at {url} has no workers. Start some with 'dask worker HOST:PORT --nworkers auto "
@@ -62,5 +69,5 @@ def cluster(url: str) -> Iterator[Executor]:
 
 
 def died_with_its_worker(failure: BaseException) -> bool:
-    """Whether Dask gave a call up because worker after worker died at it; known by name, as Dask may not be there."""
+    """Return whether Dask gave up a call after several workers died at it; by name, as Dask need not be installed."""
     return type(failure).__name__ == "KilledWorker"

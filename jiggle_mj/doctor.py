@@ -1,28 +1,43 @@
-"""Whether this machine can run jiggle-mj: versions, JAX devices, offscreen OpenGL, cores and memory, with remedies.
+"""Checks that this machine can run jiggle-mj: versions, JAX devices, offscreen OpenGL, cores and memory, with remedies.
 
-What may crash or hang (JAX on a broken driver, OpenGL) is tried in a process of its own under a time limit.
-Does not measure speed, and prints nothing: the command line shows the checks.
+Code that may crash or hang (JAX on a broken driver, OpenGL) runs in a separate process under a time limit. Does not
+measure speed, and prints nothing: the command line shows the checks.
 """
 
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from typing import Literal
 
-OPENGL_PACKAGES = {"egl": ("libegl1", "libgl1", "libgl1-mesa-dri"), "osmesa": ("libosmesa6", "libgl1")}
+from .worker_processes import usable_cores
+
+Backend = Literal["egl", "osmesa"]
+"""Value of MUJOCO_GL that renders offscreen."""
+
+OPENGL_PACKAGES: dict[Backend, tuple[str, ...]] = {
+    "egl": ("libegl1", "libgl1", "libgl1-mesa-dri"),
+    "osmesa": ("libosmesa6", "libgl1"),
+}
 """Debian and Ubuntu packages that hold the software driver behind each value of MUJOCO_GL."""
 
 MINIMUM_PYTHON = (3, 11)
+"""Oldest Python that the package supports."""
 PACKAGES = ("mujoco", "mujoco-mjx", "jax", "numpy", "opencv-python-headless", "mcap")
-"""Those whose version decides whether anything works."""
+"""Packages whose versions are checked, as nothing works with older ones."""
 MINIMUM_MEMORY = 4e9
-"""What a full run needs with some room [B]."""
+"""Memory that a full run needs, with a margin [byte]."""
 MINIMUM_CORES = 2
+"""Cores below which everything runs slower than docs/RESULTS.md says."""
+RENDER_LIMIT_S = 10.0
+"""Time for a process to render one frame [s]; a driver that hangs never does."""
+JAX_LIMIT_S = 60.0
+"""Time for a process to import JAX and list its devices [s]; only a driver that hangs takes longer."""
 
-_RENDER = """
+_RENDER_CODE = """
 import mujoco
 model = mujoco.MjModel.from_xml_string(
     '<mujoco><worldbody><light pos="0 0 3"/><geom type="sphere" size="1" rgba="1 0 0 1"/></worldbody></mujoco>')
@@ -38,7 +53,7 @@ if not image[24, 32, 0] > image[24, 32, 2]:
 print(driver)
 """
 
-_JAX = """
+_JAX_CODE = """
 import jax, jax.numpy as jnp
 kinds = [f"{device.platform} ({device.device_kind})" for device in jax.devices()]
 single = jnp.ones(3).sum().dtype
@@ -52,56 +67,62 @@ print(", ".join(kinds) + f"; {single} by default, {double} where asked for")
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One thing looked at."""
+    """Result of one check."""
 
     name: str
+    """Name of what is checked."""
     ok: bool
+    """Whether nothing needs to be done."""
     detail: str
-    """What was found."""
+    """What was found on this machine."""
     remedy: str = ""
-    """What to do about it; empty where nothing needs doing."""
+    """What the user can do; empty where nothing needs to be done."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Probe:
-    """How a trial in a process of its own ended."""
+class Probe:
+    """Result of code that ran in a separate process."""
 
     ok: bool
-    said: str
-    """The last line it printed, or why it failed."""
+    """Whether it ended without an error."""
+    message: str
+    """The last line that it printed, or the reason why it failed."""
 
 
 def doctor() -> list[Check]:
-    """Look at everything; takes a few seconds.
+    """Check this machine; takes a few seconds.
 
     Returns:
-        One check per subject, in a fixed order. Offscreen OpenGL is fine when one of its two drivers is.
+        One check per subject, in a fixed order.
     """
-    return [_python(), *_versions(), _jax(), *_offscreen_opengl(), _cores(), _memory()]
+    return [_check_python(), *_check_packages(), check_jax(), *check_opengl(), _check_cores(), _check_memory()]
 
 
-def render_failure(backend: Literal["egl", "osmesa"], *, time_limit: float = 10.0) -> str | None:
-    """Render one frame offscreen in a process of its own.
+def render_failure(backend: Backend, *, time_limit: float = RENDER_LIMIT_S) -> str | None:
+    """Render one frame offscreen in a separate process and return what went wrong; None where it works.
 
     Args:
         backend: value of MUJOCO_GL to try.
-        time_limit: when to give up [s].
-
-    Returns:
-        None where it works, else what went wrong.
+        time_limit: time after which the process is ended [s].
     """
-    probe = _render(backend, time_limit=time_limit)
-    return None if probe.ok else probe.said
+    probe = render_probe(backend, time_limit=time_limit)
+    return None if probe.ok else probe.message
 
 
-def _render(backend: str, *, time_limit: float) -> _Probe:
-    return _try(_RENDER, time_limit=time_limit, MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
+def render_probe(backend: Backend, *, time_limit: float = RENDER_LIMIT_S) -> Probe:
+    """Render one frame offscreen in a separate process; the message is the driver's name, or the reason it failed.
+
+    Args:
+        backend: value of MUJOCO_GL to try.
+        time_limit: time after which the process is ended [s].
+    """
+    return _run(_RENDER_CODE, time_limit=time_limit, MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
 
 
-def _try(code: str, *, time_limit: float, **environment: str) -> _Probe:
-    """Run Python code in a process of its own."""
+def _run(code: str, *, time_limit: float, **environment: str) -> Probe:
+    """Run Python code in a separate process."""
     try:
-        done = subprocess.run(
+        completed = subprocess.run(
             [sys.executable, "-c", code],
             env={**os.environ, **environment},
             stdin=subprocess.DEVNULL,
@@ -110,10 +131,10 @@ def _try(code: str, *, time_limit: float, **environment: str) -> _Probe:
             timeout=time_limit,
         )
     except subprocess.TimeoutExpired:
-        return _Probe(ok=False, said=f"no answer within {time_limit:g} s")
-    if done.returncode == 0:
-        return _Probe(ok=True, said=_last_line(done.stdout))
-    return _Probe(ok=False, said=_failure(done.stderr) or f"the process ended with code {done.returncode}")
+        return Probe(ok=False, message=f"no answer within {time_limit:g} s")
+    if completed.returncode == 0:
+        return Probe(ok=True, message=_last_line(completed.stdout))
+    return Probe(ok=False, message=_failure(completed.stderr) or f"the process ended with code {completed.returncode}")
 
 
 def _last_line(text: str) -> str:
@@ -122,88 +143,94 @@ def _last_line(text: str) -> str:
 
 
 def _failure(stderr: str) -> str:
-    """The exception's line of a traceback, which clean-up code may have followed with others of its own."""
+    """Return the exception's line of a traceback; the lines of exceptions in clean-up code may follow it."""
     before_clean_up = stderr.split("Exception ignored in", maxsplit=1)[0]
     return _last_line(before_clean_up)
 
 
-def _python() -> Check:
-    found = sys.version_info[:3]
-    ok = found[:2] >= MINIMUM_PYTHON
-    wanted = ".".join(map(str, MINIMUM_PYTHON))
+def _check_python() -> Check:
+    installed = sys.version_info[:3]
+    ok = installed[:2] >= MINIMUM_PYTHON
+    required = ".".join(map(str, MINIMUM_PYTHON))
     return Check(
         name="python",
         ok=ok,
-        detail=".".join(map(str, found)),
-        remedy="" if ok else f"Install Python {wanted} or newer.",
+        detail=".".join(map(str, installed)),
+        remedy="" if ok else f"Install Python {required} or newer.",
     )
 
 
-def _versions() -> list[Check]:
-    """The packages against the lower bounds in this distribution's own metadata."""
+def _check_packages() -> list[Check]:
+    """Check the packages against the lower bounds in the metadata of this distribution."""
     bounds = dict(re.findall(r"^([\w-]+)>=([\d.]+)$", "\n".join(requires("jiggle-mj") or []), flags=re.MULTILINE))
-    return [_version(package, bounds[package]) for package in PACKAGES]
+    return [check_package(package, bounds[package]) for package in PACKAGES]
 
 
-def _version(package: str, minimum: str) -> Check:
-    wanted = f"{package}>={minimum}"
+def check_package(package: str, minimum: str) -> Check:
+    """Check that a package is installed in a minimum version."""
+    requirement = f"{package}>={minimum}"
     try:
-        found = version(package)
+        installed = version(package)
     except PackageNotFoundError:
-        return Check(name=package, ok=False, detail="not installed", remedy=f"pip install '{wanted}'")
-    ok = _release(found) >= _release(minimum)
-    return Check(name=package, ok=ok, detail=found, remedy="" if ok else f"pip install --upgrade '{wanted}'")
+        return Check(name=package, ok=False, detail="not installed", remedy=f"pip install '{requirement}'")
+    ok = release_numbers(installed) >= release_numbers(minimum)
+    return Check(name=package, ok=ok, detail=installed, remedy="" if ok else f"pip install --upgrade '{requirement}'")
 
 
-def _release(text: str) -> tuple[int, ...]:
-    """The leading numbers of a version: (3, 17, 0) of 3.17.0.dev0."""
+def release_numbers(text: str) -> tuple[int, ...]:
+    """Return the leading numbers of a version: (3, 17, 0) of 3.17.0.dev0."""
     return tuple(int(part) for part in re.findall(r"\d+", re.split(r"[^\d.]", text)[0]))
 
 
-def _jax() -> Check:
-    probe = _try(_JAX, time_limit=60.0)
+def check_jax() -> Check:
+    """Check that JAX finds a device and computes in float64 on request."""
+    probe = _run(_JAX_CODE, time_limit=JAX_LIMIT_S)
     return Check(
         name="jax devices",
         ok=probe.ok,
-        detail=probe.said,
+        detail=probe.message,
         remedy="" if probe.ok else "Set JAX_PLATFORMS=cpu, or reinstall jax and jaxlib in matching versions.",
     )
 
 
-def _offscreen_opengl() -> list[Check]:
-    """Both drivers; the second is a fall-back, so its absence beside a working first is no fault."""
-    probes = {backend: _render(backend, time_limit=10.0) for backend in OPENGL_PACKAGES}
-    some = any(probe.ok for probe in probes.values())
+def check_opengl(probe_backend: Callable[[Backend], Probe] = render_probe) -> list[Check]:
+    """Check both offscreen OpenGL drivers; one that works is enough, so the other one is then fine as well.
+
+    Args:
+        probe_backend: renders a frame with a driver.
+    """
+    probes: dict[Backend, Probe] = {backend: probe_backend(backend) for backend in OPENGL_PACKAGES}
+    one_works = any(probe.ok for probe in probes.values())
     return [
         Check(
             name=f"offscreen OpenGL, {backend}",
-            ok=probe.ok or some,
-            detail=probe.said if probe.ok or not some else f"not available ({probe.said}); not needed",
+            ok=probe.ok or one_works,
+            detail=probe.message if probe.ok or not one_works else f"not available ({probe.message}); not needed",
             remedy=""
-            if some
+            if one_works
             else f"apt-get install {' '.join(OPENGL_PACKAGES[backend])}, then set MUJOCO_GL={backend}.",
         )
         for backend, probe in probes.items()
     ]
 
 
-def _cores() -> Check:
-    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    ok = found >= MINIMUM_CORES
+def _check_cores() -> Check:
+    cores = usable_cores()
+    ok = cores >= MINIMUM_CORES
     return Check(
         name="cores",
         ok=ok,
-        detail=str(found),
-        remedy="" if ok else "Everything works, slower than the figures of docs/RESULTS.md.",
+        detail=str(cores),
+        remedy="" if ok else "Everything works, but slower than docs/RESULTS.md says.",
     )
 
 
-def _memory() -> Check:
-    found = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    ok = found >= MINIMUM_MEMORY
+def _check_memory() -> Check:
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    ok = memory >= MINIMUM_MEMORY
     return Check(
         name="memory",
         ok=ok,
-        detail=f"{found / 1e9:.1f} GB",
-        remedy="" if ok else f"A run may need {MINIMUM_MEMORY / 1e9:.0f} GB.",
+        detail=f"{memory / 1e9:.1f} GB",
+        remedy="" if ok else f"A run may need {MINIMUM_MEMORY / 1e9:.0f} GB of memory.",
     )

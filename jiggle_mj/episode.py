@@ -1,7 +1,7 @@
-"""The loop: actions move the reference tissue, observations move the estimate, and both are written as they come.
+"""The loop of an episode: actions move the reference tissue, observations update the estimate, both are written.
 
-Three streams that compose: `observe` turns actions into observations (and records them), `estimate` turns observations
-into an estimate (and records it); a recording is another source of observations. Nothing is scored here.
+`observe` executes actions, and yields and records observations; `estimate` updates an estimator with observations and
+records the estimate. A recording is another source of observations. Scoring is in `jiggle_mj.eval`.
 """
 
 import time
@@ -18,37 +18,45 @@ from .observation import Observation
 from .recording.declaration import identity
 from .recording.estimate import EstimateWriter
 from .recording.mcap_files import truth_path
-from .recording.reader import Recording, RecordingWriter
+from .recording.reader import Recording
 from .recording.truth import TruthWriter
+from .recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
     from jiggle_mj.estimator import Estimator, EstimatorConfig
     from jiggle_mj.scenes import Reference, Scene
 
 RECORDING, ESTIMATE, RESULT, REPORT = "run.mcap", "estimate.mcap", "result.json", "report.html"
+"""Files in the output folder of a run."""
+SHOWN_REASONS = 3
+"""How many skipped frames an error names, so that it stays one line."""
 
 OnFrame = Callable[[Observation, Estimate | None], None]
-"""Called after each frame, for progress; the estimate is None where there is none."""
+"""Callback after each frame, for progress; the estimate is None for a frame that updates nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """What the estimator made of a series of observations."""
+    """The estimate of a series of observations."""
 
     sheet: Sheet
+    """Particles of the estimator."""
     estimates: tuple[Estimate, ...]
+    """Estimate after each used frame."""
     belief: Belief
+    """Belief after the last frame."""
     detection: Detection
+    """Particles that the final belief reports attached."""
     prior_entropy: float
-    """Of the belief before anything was seen [nat]."""
+    """Differential entropy of the belief before the first observation [nat]."""
     n_frames: int
-    """Of the source, those with open jaws and the skipped ones among them."""
+    """Number of frames of the source, including those with open jaws and the skipped ones."""
     skipped: tuple[tuple[int, str], ...]
     """Index and reason of each frame that the recording or the estimator could not use."""
 
 
 class Stopwatch:
-    """Adds up the time spent in one part of a loop."""
+    """Sum of the time spent in one part of a loop."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -61,28 +69,30 @@ class Stopwatch:
 
 
 def check_directory(directory: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Check that the files to come may be written.
+    """Check that files may be written to a folder; create and remove nothing.
 
     Args:
         directory: the folder.
-        names: of the files to come.
-        overwrite: results that are there may be replaced; `clear_directory` does it, once nothing stands in the way.
+        names: names of the files that will be written.
+        overwrite: allow existing files; `clear_directory` removes them later.
 
     Raises:
-        OutputError: it holds results, or is a file.
+        OutputError: the folder holds one of the files, or is a file.
     """
     if directory.exists() and not directory.is_dir():
         raise OutputError(f"{directory} is a file; give a folder for the results.")
-    there = [name for name in names if (directory / name).exists()]
-    if there and not overwrite:
-        raise OutputError(f"{directory} already holds {', '.join(there)}; choose another folder or pass --overwrite.")
+    existing = [name for name in names if (directory / name).exists()]
+    if existing and not overwrite:
+        raise OutputError(
+            f"{directory} already holds {', '.join(existing)}; choose another folder or pass --overwrite."
+        )
 
 
 def clear_directory(directory: Path, names: Iterable[str]) -> None:
-    """Make the folder, and remove an earlier run's files, so that no old report stands beside new results.
+    """Create the folder, and remove the files of an earlier run, so that no old report stays beside new results.
 
     Raises:
-        OutputError: the folder cannot be made, or a file not removed.
+        OutputError: the folder cannot be created, or a file cannot be removed.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -93,8 +103,8 @@ def clear_directory(directory: Path, names: Iterable[str]) -> None:
 
 
 def recording_identity(scene: "Scene", sensing: str, seed: int, policy: str = "") -> str:
-    """Ties a recording, its truth and its estimate together: a digest of all that they depend on."""
-    from jiggle_mj.scenes import scene_table  # here, so that a recording can be estimated without MuJoCo
+    """Return the identity that a recording, its truth and its estimate share: a digest of all that they depend on."""
+    from jiggle_mj.scenes import scene_table  # imported here, so that a recording can be estimated without MuJoCo
 
     return identity(scene_table(scene), sensing, seed, policy)
 
@@ -110,43 +120,52 @@ def observe(
     watch: Stopwatch | None = None,
     on_refused: Callable[[ActionError], bool] | None = None,
 ) -> Iterator[Observation]:
-    """Carry out actions on the reference tissue, one observation each but where a frame was lost.
+    """Execute actions on the reference tissue and yield one observation for each, except where a frame is lost.
 
     Args:
         reference: the tissue.
-        actions: what to do; may be a policy that looks at the estimate before it yields the next.
-        path: where to record, truth in a file of its own beside it; None for nowhere.
-        seed: of the run, for the recording's metadata.
-        policy: who chooses the actions, with all that it depends on; empty for the scene's programme.
-        overwrite: replace files that are there.
-        watch: adds up the time of the simulation.
-        on_refused: told of an action that cannot be carried out, and says whether there is another; if None, it is
-            raised.
+        actions: the actions; may be a policy that reads the estimate before it yields the next one.
+        path: the recording to write, with the truth in a separate file beside it; None to record nothing.
+        seed: seed of the run, for the recording's metadata.
+        policy: name of the policy that chooses the actions, with its settings; empty for the scene's programme.
+        overwrite: replace existing files.
+        watch: accumulates the time of the simulation.
+        on_refused: called with the error of an action that cannot be executed; returns whether to continue with the
+            next action. None to raise the error.
+
+    Raises:
+        ActionError: an action cannot be executed, and `on_refused` is None.
+        OutputError: the files exist, or cannot be written.
     """
     watch = watch or Stopwatch()
     with ExitStack() as files:
         recording = truth_file = None
         if path is not None:
-            start = reference.truth()
+            initial_truth = reference.truth()
             name = recording_identity(reference.scene, reference.sensing, seed, policy)
-            about = {"name": start.scene, "seed": str(seed), "sensing": reference.sensing, "identity": name}
+            run_metadata = {
+                "name": initial_truth.scene,
+                "seed": str(seed),
+                "sensing": reference.sensing,
+                "identity": name,
+            }
             recording = files.enter_context(
                 RecordingWriter(
                     path,
                     camera=reference.camera,
                     declaration=reference.declaration,
-                    metadata=about | reference.metadata,
+                    metadata=run_metadata | reference.metadata,
                     overwrite=overwrite,
                 )
             )
             truth_file = files.enter_context(
                 TruthWriter(
                     truth_path(path),
-                    rest=start.rest,
-                    faces=start.faces,
-                    attached=start.attached,
-                    scene=start.scene,
-                    details=start.details,
+                    rest=initial_truth.rest,
+                    faces=initial_truth.faces,
+                    attached=initial_truth.attached,
+                    scene=initial_truth.scene,
+                    details=initial_truth.details,
                     identity=name,
                     overwrite=overwrite,
                 )
@@ -172,7 +191,7 @@ def observe(
 
 
 def settings(config: "EstimatorConfig") -> dict[str, str]:
-    """A configuration as an estimate's metadata holds it."""
+    """Return a configuration as the metadata of an estimate holds it."""
     return {name: str(value) for name, value in asdict(config).items()}
 
 
@@ -184,39 +203,39 @@ def estimate(
     metadata: dict[str, str] | None = None,
     on_frame: OnFrame | None = None,
 ) -> Episode:
-    """Show observations to an estimator, one after the other.
+    """Update an estimator with observations, one after the other, and return the result.
 
     Args:
-        observations: from `observe`, or a recording.
-        estimator: a fresh one.
-        path: where to write the estimate; None for nowhere.
-        metadata: of that file.
+        observations: the yield of `observe`, or a recording.
+        estimator: an estimator that has seen nothing yet.
+        path: the estimate to write; None to write nothing.
+        metadata: further metadata of that file.
         on_frame: called after each frame.
 
     Raises:
-        PerceptionError: nothing was estimated at all, or what `Estimator.update` raises.
+        PerceptionError: no frame could be used, or `Estimator.update` raises it.
     """
     estimates: list[Estimate] = []
     n_frames = 0
     with ExitStack() as files:
         writer: EstimateWriter | None = None
         for observation in observations:
-            one = estimator.update(observation)
-            if one is not None:
+            updated = estimator.update(observation)
+            if updated is not None:
                 if writer is None and path is not None:
-                    said = settings(estimator.config) | (metadata or {})
-                    writer = files.enter_context(EstimateWriter(path, estimator.sheet, said))
+                    all_metadata = settings(estimator.config) | (metadata or {})
+                    writer = files.enter_context(EstimateWriter(path, estimator.sheet, all_metadata))
                 if writer is not None:
-                    writer.write(one, n_skipped=len(estimator.skipped))
-                estimates.append(one)
+                    writer.write(updated, n_skipped=len(estimator.skipped))
+                estimates.append(updated)
             n_frames += 1
             if on_frame is not None:
-                on_frame(observation, one)
+                on_frame(observation, updated)
         estimator.release()
-        unread = observations.skipped if isinstance(observations, Recording) else []
-        skipped = tuple(sorted((*unread, *estimator.skipped)))
+        unreadable = observations.skipped if isinstance(observations, Recording) else []
+        skipped = tuple(sorted((*unreadable, *estimator.skipped)))
         if not estimates:
-            why = "; ".join(f"frame {index}: {reason}" for index, reason in skipped[:3])
+            why = "; ".join(f"frame {index}: {reason}" for index, reason in skipped[:SHOWN_REASONS])
             raise PerceptionError(
                 f"no frame could be used ({why or 'none has closed jaws'}); the estimator learns from frames in which "
                 "the tool holds the tissue."
@@ -229,6 +248,6 @@ def estimate(
         belief=estimator.belief,
         detection=estimator.detection,
         prior_entropy=estimator.prior_entropy,
-        n_frames=n_frames + len(unread),
+        n_frames=n_frames + len(unreadable),
         skipped=skipped,
     )

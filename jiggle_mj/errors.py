@@ -1,11 +1,11 @@
-"""What can go wrong with data and environment, each named so that a caller can tell them apart.
+"""Errors of data and environment, one class for each kind that a caller may handle.
 
-Wrong arguments raise `ValueError`; everything here is a `JiggleError`, which the command line prints as one line.
+Wrong arguments raise `ValueError`; every class here is a `JiggleError`, which the command line prints as one line.
 """
 
 
 class JiggleError(Exception):
-    """Base of the errors that a user can mend: the message says what was given, what is allowed, what to do."""
+    """Base of the errors that a user can correct: the message says what was given, what is allowed, what to do."""
 
 
 class SceneError(JiggleError):
@@ -41,8 +41,8 @@ class OutputError(JiggleError):
 
 
 class OptionError(JiggleError, ValueError):
-    """An option or argument that is out of its range, or does not go with another."""
+    """An option or argument is out of its range, or contradicts another."""
 
 
 class ClusterError(JiggleError):
-    """The cluster that was asked for cannot be used: its package is not installed, or nothing answers there."""
+    """The requested cluster cannot be used: Dask is not installed, or nothing answers at the address."""

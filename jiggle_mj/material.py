@@ -1,4 +1,4 @@
-"""What a recording tells of the sheet itself, and what it cannot tell."""
+"""The material ratios that a recording identifies, and those that it does not."""
 
 from dataclasses import dataclass, replace
 
@@ -7,46 +7,50 @@ import numpy as np
 from .observation import Declaration
 
 DOUBTFUL = np.log(2) / 2
-"""Standard error of a logarithm from which on nothing is stated: two of them are a factor of two either way."""
-STRETCH = (
-    "positions alone know only ratios: with every stiffness and the weight times one factor, nothing moves otherwise. "
+"""Standard error of a factor's logarithm from which on it is refused: two of them are a factor of two either way."""
+WHY_NO_MEMBRANE_STIFFNESS = (
+    "positions alone give only ratios: one factor on every stiffness and on the weight changes no position. "
     "Weigh the tissue: the ratio of weight to membrane stiffness then gives the latter. Or measure one force"
 )
-"""Why the membrane stiffness itself is never stated."""
+"""Reason why the membrane stiffness itself is never identified."""
+MAX_LOG_FACTOR = 7.0
+"""Largest logarithm of an uncertainty that is printed, a factor of 1100: more says nothing further."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ratio:
-    """The weight or the bending stiffness over the membrane stiffness."""
+    """Ratio of the weight or of the bending stiffness to the membrane stiffness."""
 
     declared: float
-    """[unit]."""
+    """Ratio of the declared values [unit]."""
     unit: str
+    """Unit of the ratio."""
     factor: float
-    """Times what was declared."""
+    """Identified ratio over the declared one."""
     log_sd: float
     """Standard error of the factor's logarithm: about its relative error, where the model is right."""
     refused: str | None
-    """Why it is not to be relied on; None where it may be."""
+    """Reason why the factor is unreliable; None where it is reliable."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """What was found of one sheet."""
+    """Identified material of one sheet."""
 
     declared: Declaration
+    """What the user declared."""
     ratios: dict[str, Ratio]
-    """By name, `weight` (where there is any) and `bending`."""
+    """Ratios by name: `bending`, and `weight` where there is gravity."""
 
     @property
     def refused(self) -> dict[str, str]:
-        """Why what is not identified is not; the membrane stiffness itself never is."""
+        """Return the reason for each quantity that is not identified; the membrane stiffness itself never is."""
         why = {name: ratio.refused for name, ratio in self.ratios.items() if ratio.refused is not None}
-        return why | {"membrane stiffness": STRETCH}
+        return why | {"membrane stiffness": WHY_NO_MEMBRANE_STIFFNESS}
 
     @property
     def declaration(self) -> Declaration:
-        """What was declared, with every ratio that is not refused; the weight is taken to be as declared."""
+        """Return the declaration with every reliable ratio applied; the weight stays as declared."""
         known = {name: ratio.factor for name, ratio in self.ratios.items() if ratio.refused is None}
         return replace(
             self.declared,
@@ -58,23 +62,23 @@ class Material:
 def material(
     declared: Declaration, factors: dict[str, float], log_sd: dict[str, float], *, converged: bool
 ) -> Material:
-    """Factors on what was declared, refused where they are not known to a factor of two.
+    """Return the identified material; a factor that is not known to a factor of two is refused.
 
     Args:
-        declared: what they are relative to.
-        factors: of `weight` and `bending`, as far as the sheet has them.
+        declared: the declaration that the factors are relative to.
+        factors: factors of `weight` and `bending`, as far as the sheet has them.
         log_sd: standard errors of their logarithms.
-        converged: whether the search came to rest.
+        converged: whether the search converged.
     """
     k = declared.membrane_stiffness
-    of = {
+    declared_ratios = {
         "weight": (declared.areal_density * float(np.linalg.norm(declared.gravity)) / k, "1/m"),
         "bending": (declared.thickness**2 / (12 * (1 - declared.poisson**2)), "m^2"),
     }
     ratios = {
         name: Ratio(
-            declared=of[name][0],
-            unit=of[name][1],
+            declared=declared_ratios[name][0],
+            unit=declared_ratios[name][1],
             factor=factor,
             log_sd=log_sd[name],
             refused=_refusal(log_sd[name], converged=converged),
@@ -86,10 +90,10 @@ def material(
 
 def _refusal(log_sd: float, *, converged: bool) -> str | None:
     if not converged:
-        return "the search did not come to rest"
+        return "the search did not converge"
     if log_sd < DOUBTFUL:
         return None
     return (
-        f"these frames know it to a factor of {np.exp(min(2 * log_sd, 7)):.2g} either way (two standard errors); lift "
-        "further, so that more of the sheet hangs"
+        f"these frames give it to a factor of {np.exp(min(2 * log_sd, MAX_LOG_FACTOR)):.2g} either way (two standard "
+        "errors); lift further, so that more of the sheet hangs"
     )

@@ -1,7 +1,7 @@
-"""Whether a triangle mesh is one sheet that a membrane can be computed on.
+"""Checks that a triangle mesh is one sheet on which a membrane can be computed.
 
-Checks connectivity, area, and that no triangle faces down where the sheet at rest is seen from above, as one that is
-folded does; not the quality of angles, which the solvers tolerate.
+Checks connectivity and areas, and that the sheet at rest is not folded: seen from above, no triangle faces down. Does
+not check the quality of angles, which the solvers tolerate.
 """
 
 import numpy as np
@@ -13,16 +13,20 @@ from .errors import MeshError
 
 MINIMUM_RELATIVE_AREA = 1e-6
 """Twice a triangle's area over its longest edge squared, below which it has no usable normal in float32."""
-STEEP, STEEP_SHARE = 0.2, 0.05
-"""Cosine between normals below which a triangle stands on edge, and the share of such that a rough sheet may have."""
+STEEP_COSINE = 0.2
+"""Cosine between a triangle's normal and the sheet's below which the triangle stands on edge."""
+MAX_STEEP_SHARE = 0.05
+"""Share of triangles on edge that a rough sheet may have."""
+MAX_LISTED_SHEETS = 5
+"""How many disconnected sheets an error lists with their sizes."""
 
 
 def check_mesh(vertices: Shaped[np.ndarray, "..."], faces: Shaped[np.ndarray, "..."]) -> None:
     """Refuse a mesh that is not one consistently oriented sheet of triangles with area.
 
     Args:
-        vertices: positions [m], to be of shape (n, 3).
-        faces: vertex numbers of each triangle, counted from 0, to be integers of shape (f, 3).
+        vertices: positions [m]; must have shape (n, 3).
+        faces: vertex numbers of each triangle, from 0; must be integers of shape (f, 3).
 
     Raises:
         MeshError: no triangles, wrong shapes, vertices that are not finite, vertex numbers out of range, a vertex
@@ -51,17 +55,17 @@ def check_unfolded(
     """Refuse a rest shape that does not lie open when seen along the normal of its best-fit plane, `above`.
 
     Raises:
-        MeshError: a triangle is turned over against the whole, or more than `STEEP_SHARE` of them stand up: the sheet
+        MeshError: a triangle faces against the others, or more than `MAX_STEEP_SHARE` of them stand on edge: the sheet
             is folded, or touches itself.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     upright = normals @ above * np.sign(np.sum(normals @ above))
-    turned, steep = int(np.sum(upright < 0)), int(np.sum(np.abs(upright) < STEEP))
-    if turned or steep > STEEP_SHARE * len(faces):
+    flipped, steep = int(np.sum(upright < 0)), int(np.sum(np.abs(upright) < STEEP_COSINE))
+    if flipped or steep > MAX_STEEP_SHARE * len(faces):
         raise MeshError(
-            f"the sheet at rest is folded: seen along its normal, {turned} of {len(faces)} triangles are turned over "
+            f"the sheet at rest is folded: seen along its normal, {flipped} of {len(faces)} triangles are turned over "
             f"and {steep} stand on edge. Spread the tissue before the first grasp, or declare a mesh of it spread."
         )
 
@@ -118,6 +122,5 @@ def _check_one_piece(n_vertices: int, faces: Int[np.ndarray, "f 3"]) -> None:
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(n_vertices, n_vertices))
     pieces, label = connected_components(graph, directed=False)
     if pieces > 1:
-        raise MeshError(
-            f"the mesh has {pieces} disconnected sheets, of {np.bincount(label).tolist()[:5]} vertices; give one sheet."
-        )
+        sizes = np.bincount(label).tolist()[:MAX_LISTED_SHEETS]
+        raise MeshError(f"the mesh has {pieces} disconnected sheets, of {sizes} vertices; give one sheet.")

@@ -1,6 +1,6 @@
-"""What crosses from the tissue to the estimator; actions, which go the other way, are in `actions`.
+"""Observations and the user's declaration: all that the estimator sees. Actions are in `actions`.
 
-An `Observation` is all that the estimator ever sees. World frame: z up, SI units, times in integer nanoseconds from 0.
+World frame: z up, SI units, times in integer nanoseconds from 0.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from .actions import Cut, Suture
 from .errors import RecordingError
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
-"""The quaternion wxyz of no rotation."""
+"""Quaternion wxyz of the identity rotation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,9 +24,9 @@ class StereoPair:
     """
 
     left: UInt8[np.ndarray, "height width 3"]
-    """RGB."""
+    """RGB image of the left camera."""
     right: UInt8[np.ndarray, "_height _width 3"]
-    """RGB, of the left one's size."""
+    """RGB image of the right camera, of the same size."""
 
     def __post_init__(self) -> None:
         """Check that the two images have one size."""
@@ -39,15 +39,15 @@ class MeasuredPoints:
     """Points measured on the tissue.
 
     Raises:
-        RecordingError: a standard deviation that is none.
+        RecordingError: the standard deviation is not finite and above 0.
     """
 
     positions: Float[np.ndarray, "m 3"]
-    """World [m]; NaN rows are points that were not seen."""
+    """Positions in the world frame [m]; NaN for a point that is not seen."""
     track_id: Int[np.ndarray, " m"] | None = None
-    """The same number means the same material point in every frame; None for clouds without correspondence."""
+    """Number of the material point, the same in every frame; None for clouds without correspondence."""
     sd: float = 2e-4
-    """Stated standard deviation of each coordinate [m]."""
+    """Standard deviation of each coordinate's noise [m]."""
 
     def __post_init__(self) -> None:
         """Check the noise."""
@@ -60,90 +60,97 @@ class ToolState:
     """The tweezer as the robot reports it."""
 
     position: Float[np.ndarray, " 3"]
-    """Tip, world [m]."""
+    """Position of the tip in the world frame [m]."""
     quat_wxyz: Float[np.ndarray, " 4"]
-    """Orientation, world."""
+    """Orientation of the tweezer in the world frame."""
     closed: bool
     """Whether the jaws hold the tissue."""
     grasp: int
-    """Number of the current or last grasp, counted from 1; 0 before the first."""
+    """Number of the current or last grasp, from 1; 0 before the first."""
     radius: float
-    """Particles within this distance of the tip when the jaws close are held [m]."""
+    """Distance from the tip within which particles are held when the jaws close [m]."""
     held_tracks: tuple[int, ...] = ()
-    """Track ids known to be held, for recordings that declare them; empty means 'by radius'."""
+    """Track ids of the held points where the recording declares them; if empty, `radius` decides."""
     by_points: bool = False
-    """Whether the position is where the held points were seen, so that it says nothing of its own."""
+    """Whether `position` is the mean of the held points, and so no independent measurement."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ToolReport:
-    """Where the robot said that the tip was, between two observations."""
+    """The robot's report of the tip position between two observations."""
 
     time: int
-    """As `Observation.time` [ns]."""
+    """Time on the clock of `Observation.time` [ns]."""
     position: Float[np.ndarray, " 3"]
-    """World [m]."""
+    """Position of the tip in the world frame [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """One moment: the tool, and images or measured points; where there are both, the estimator uses the images."""
+    """The tool, and images or measured points, at one time; where there are both, the estimator uses the images."""
 
     index: int
     """Position in the recording, skipped frames counted."""
     time: int
     """Time from the recording's start [ns]."""
     tool: ToolState
+    """State of the tweezer."""
     reports: tuple[ToolReport, ...] = ()
-    """Of the tool since the observation before, where it reports more often than something is seen."""
+    """Reports of the tool since the observation before, where it reports more often than frames come."""
     images: StereoPair | None = None
+    """The stereo pair; None where the recording has points only."""
     points: MeasuredPoints | None = None
+    """The measured points; None where the recording has images only."""
     events: tuple[Cut | Suture, ...] = ()
-    """What was cut or sewn since the observation before, as intended."""
+    """Intended cuts and sutures since the observation before."""
 
     @property
     def lost(self) -> bool:
-        """Whether nothing was seen: the frame never came, and the next one has its index."""
+        """Return whether the frame never came: it has neither images nor points, and the next frame has its index."""
         return self.images is None and self.points is None
 
 
 @dataclass(frozen=True, kw_only=True)
 class DeclaredMesh:
-    """A mesh that the user declares for imported data; its vertices may reach beyond what is seen."""
+    """A mesh that the user declares for imported data; it may reach beyond the view."""
 
     vertices: Float[np.ndarray, "n 3"]
-    """Rest positions [m]."""
+    """Rest positions in the world frame [m]."""
     faces: Int[np.ndarray, "f 3"]
+    """Vertex numbers of each triangle, from 0."""
     track_id: Int[np.ndarray, " n"]
-    """Track id of the measured point at each vertex, -1 where nothing is measured."""
+    """Track id of the measured point at each vertex; -1 where nothing is measured."""
     held: Bool[np.ndarray, " n"] | None = None
-    """Vertices known to be in the grip, where the tool's radius cannot say; None for 'by radius'."""
+    """Which vertices the jaws hold, where the tool's radius cannot tell; if None, the radius decides."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Declaration:
-    """What the user says is known of the tissue before anything is seen. Not truth: it may be wrong.
+    """The user's prior knowledge of the tissue. It is not the truth: it may be wrong.
 
-    Positions alone give stiffness ratios only; `membrane_stiffness` is what turns them into N/m.
+    Positions alone give stiffness ratios only; `membrane_stiffness` converts them to N/m.
     """
 
     membrane_stiffness: float = 30.0
     """Young's modulus times thickness [N/m]."""
     poisson: float = 0.45
+    """Poisson's ratio, in [0, 0.5)."""
     thickness: float = 1e-3
-    """[m]; with the membrane stiffness it gives the bending stiffness."""
+    """Thickness [m]; with the membrane stiffness it gives the bending stiffness."""
     areal_density: float = 1.0
     """Mass per area [kg/m^2]."""
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    """[m/s^2], world; zeros where nobody knows which way is down. A sheet that `hangs` in a plane near it hangs by it:
-    then only its size counts, and it was first seen stretched by its weight, held by its topmost particles."""
+    """Gravity in the world frame [m/s^2]; zeros where the vertical is unknown. For a sheet that `hangs` in a plane near
+    this direction only the magnitude counts: gravity is taken within the plane, and the first frame shows the sheet
+    stretched by its weight and held by its topmost particles."""
     bed: bool = True
-    """Whether the tissue lies on a bed at rest, which it cannot pass; without gravity there is none."""
+    """Whether the resting tissue lies on a bed that it cannot penetrate; without gravity there is no bed."""
     mesh: DeclaredMesh | None = None
+    """Declared mesh; None to triangulate the first frame."""
 
     @property
     def hangs(self) -> bool:
-        """Whether it has weight, and no bed under it."""
+        """Return whether the sheet has weight and no bed under it."""
         return not self.bed and any(self.gravity)
 
     def __post_init__(self) -> None:

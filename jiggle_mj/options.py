@@ -1,12 +1,14 @@
-"""The words that scene files, settings and the command line share: sensing, filters, policies."""
+"""Names of options that scene files, configurations and the command line share: sensing, filters, policies."""
 
 from typing import Literal, get_args
 
 Sensing = Literal["stereo", "points", "particles", "cloud"]
-"""What the estimator is given: images; noisy tracked points of the tissue; noisy vertices of the reference; clouds."""
+"""What the estimator receives: stereo images; noisy tracked points of the tissue; noisy vertices of the reference
+mesh; a noisy cloud of other points in each frame."""
 SENSING: tuple[Sensing, ...] = get_args(Sensing)
+"""Every kind of sensing."""
 FilterName = Literal["implicit", "explicit", "adam", "nnls", "unscented"]
-"""How a frame enters the belief."""
+"""Filter that updates the belief with a frame."""
 PolicyName = Literal[
     "corners",
     "information",
@@ -22,8 +24,9 @@ PolicyName = Literal[
     "pmp-left",
     "pmp-right",
 ]
-"""Who chooses the actions: the scene's programme; ours, free to grasp anew or not, and within two procedures; the
-paper's."""
+"""Policy that chooses the actions: the scene's programme (`corners`); ours, which may grasp anew (`information`) or not
+(`one-grasp`); our two procedures (`detach`, `suture`); the paper's."""
 POLICIES: tuple[PolicyName, ...] = get_args(PolicyName)
+"""Every policy."""
 PRIMITIVES: tuple[PolicyName, ...] = tuple(name for name in POLICIES if name.startswith("pmp-"))
-"""The paper's policies that pull in one direction and look at nothing."""
+"""The paper's policies that pull in one fixed direction, whatever is observed."""

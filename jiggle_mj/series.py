@@ -1,8 +1,8 @@
-"""Many recordings of one scene, each with a seed of its own, made by any `concurrent.futures.Executor`.
+"""Many recordings of one scene, one per seed, made by any `concurrent.futures.Executor`.
 
-A recording is written in a hidden folder of its own and moved to its final name when it is whole, the truth first: a
-final name never means half a recording, whatever is killed. A series that was interrupted goes on where it was. The
-bytes depend on scene, sensing and seed alone, not on who records how many at a time.
+A recording is written in a hidden folder and moved to its final name when it is complete, the truth first: a file with
+a final name is complete, whatever process is killed. An interrupted series continues where it stopped. The bytes depend
+on scene, sensing and seed alone, not on the executor or the number of its workers.
 """
 
 import shutil
@@ -29,25 +29,30 @@ from .worker_processes import WorkerProcesses
 
 TRIES = 3
 """How many workers may die at a recording before it is given up."""
-CANCELLED = "its executor cancelled it, as one does that was stopped or lost its scheduler"
+CANCELLED = "its executor cancelled it, because it was stopped or lost its scheduler"
+"""Reason for a recording that its executor cancelled."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingSeries:
-    """What there is of a series."""
+    """The recordings of a series that exist, and the reasons for those that do not."""
 
     folder: Path
+    """Folder of the series."""
     recordings: tuple[Path, ...]
-    """Whole, by seed; the truth of each is beside it."""
+    """Complete recordings by seed; the truth of each is beside it."""
     n_kept: int
-    """Of the recordings, those that were there before."""
+    """Number of recordings that existed before."""
     failed: dict[int, str]
-    """Why there is no recording of a seed."""
+    """Reason by seed for each recording that failed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Order:
-    """One recording to be made. Clusters log the orders that fail, so the scene, which may be secret, is not shown."""
+    """One recording to make.
+
+    Clusters log the repr of an order that fails, so it omits the scene, which may be secret.
+    """
 
     scene: Scene = field(repr=False)
     sensing: Sensing
@@ -66,31 +71,31 @@ def record_series(
     overwrite: bool = False,
     on_done: Callable[[int], None] | None = None,
 ) -> RecordingSeries:
-    """Record a scene with the seeds `seed` to `seed + count - 1`, except those that are whole in the folder already.
+    """Record a scene with the seeds `seed` to `seed + count - 1`, except those that are complete in the folder.
 
-    Files are named by their seed: 000007.mcap and 000007.truth.mcap. A recording whose worker dies is begun anew, until
-    `TRIES` have died; one whose simulation fails leaves its state in 000007.failed. Either way the others go on.
+    Files are named by their seed: 000007.mcap and 000007.truth.mcap. A recording whose worker dies is restarted until
+    `TRIES` workers have died; one whose simulation fails leaves its state in 000007.failed. The others continue.
 
     Args:
-        scene: what is recorded.
-        folder: where the files go; for executors on other machines, a folder that they share under this name.
-            Recordings of other seeds that are there stay, whatever they are of.
-        count: how many.
-        sensing: what is recorded.
-        seed: of the first recording's sensing noise.
-        executor: who records, and is left running; None for processes on all cores of this machine (see
-            `WorkerProcesses`, which may be given too).
+        scene: the scene to record.
+        folder: the folder for the files; executors on other machines must share it under this name. Files of other
+            seeds stay.
+        count: number of recordings.
+        sensing: what each observation holds.
+        seed: seed of the first recording's sensing noise.
+        executor: the executor that runs the simulations; it is not shut down. None for `WorkerProcesses` on all cores
+            of this machine.
         overwrite: remove the recordings of these seeds first.
-        on_done: told the seed of each recording that is there, for progress.
+        on_done: called with the seed of each recording that exists, for progress.
 
     Returns:
-        Which recordings there are, and which failed.
+        The recordings that exist, and the reasons for those that failed.
 
     Raises:
         OptionError: fewer than one recording, or a seed below 0.
         OutputError: the folder cannot be used, or holds other recordings under these names.
-        JiggleError: what would befall every recording: the scene is impossible, no OpenGL. What is whole stays.
-        KeyboardInterrupt: what has not begun is cancelled; what is whole stays.
+        JiggleError: every recording would fail: the scene is impossible, no OpenGL. Complete recordings stay.
+        KeyboardInterrupt: recordings that have not begun are cancelled; complete ones stay.
     """
     folder = Path(folder)
     if count < 1:
@@ -98,21 +103,21 @@ def record_series(
     if seed < 0:
         raise OptionError(f"seed = {seed}: must be an integer of at least 0.")
     orders = [
-        _Order(scene=scene, sensing=sensing, seed=one, path=(folder / f"{one:06d}.mcap").absolute())
-        for one in range(seed, seed + count)
+        _Order(scene=scene, sensing=sensing, seed=each, path=(folder / f"{each:06d}.mcap").absolute())
+        for each in range(seed, seed + count)
     ]
     files = [path.name for order in orders for path in (order.path, truth_path(order.path))]
     check_directory(folder, (), overwrite=overwrite)
     clear_directory(folder, files if overwrite else ())
-    kept = {order.seed for order in orders if _is_whole(order)}
+    kept = {order.seed for order in orders if _is_complete(order)}
     on_done = on_done or (lambda _: None)
-    for one in sorted(kept):
-        on_done(one)
-    coming = [order for order in orders if order.seed not in kept]
-    with ExitStack() as own:
+    for kept_seed in sorted(kept):
+        on_done(kept_seed)
+    missing = [order for order in orders if order.seed not in kept]
+    with ExitStack() as stack:
         if executor is None:
-            executor = own.enter_context(WorkerProcesses())
-        failed = _carry_out(coming, executor, on_done)
+            executor = stack.enter_context(WorkerProcesses())
+        failed = _execute(missing, executor, on_done)
     return RecordingSeries(
         folder=folder,
         recordings=tuple(folder / order.path.name for order in orders if order.seed not in failed),
@@ -121,8 +126,8 @@ def record_series(
     )
 
 
-def _carry_out(orders: list[_Order], executor: Executor, on_done: Callable[[int], None]) -> dict[int, str]:
-    """Have the orders carried out; why some could not be, by seed."""
+def _execute(orders: list[_Order], executor: Executor, on_done: Callable[[int], None]) -> dict[int, str]:
+    """Execute the orders; return the reason by seed for those that failed."""
     finished: SimpleQueue[Future[None]] = SimpleQueue()
     pending: dict[Future[None], _Order] = {}
     deaths: Counter[int] = Counter()
@@ -151,7 +156,7 @@ def _carry_out(orders: list[_Order], executor: Executor, on_done: Callable[[int]
                 if deaths[order.seed] < TRIES:
                     submit(order)
                 else:
-                    failed[order.seed] = f"{TRIES} times its worker died or could not be started: {failure}."
+                    failed[order.seed] = f"its worker died or could not be started {TRIES} times: {failure}."
             elif isinstance(failure, SimulationError | CancelledError) or died_with_its_worker(failure):
                 failed[order.seed] = str(failure)
             else:
@@ -163,40 +168,41 @@ def _carry_out(orders: list[_Order], executor: Executor, on_done: Callable[[int]
 
 
 def _record(order: _Order) -> None:
-    """Make one recording and its truth, whole or not at all; what a killed worker left of it goes first."""
+    """Make one recording and its truth, complete or not at all; remove first what a killed worker left of it."""
     path = order.path
-    for left in path.parent.glob(f".{path.stem}-*"):
-        shutil.rmtree(left, ignore_errors=True)
+    for abandoned in path.parent.glob(f".{path.stem}-*"):
+        shutil.rmtree(abandoned, ignore_errors=True)
     with (
         tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent) as hidden,
         Reference(
             order.scene, seed=order.seed, sensing=order.sensing, dump_dir=path.with_suffix(".failed")
         ) as reference,
     ):
-        made = Path(hidden) / path.name
-        for _ in observe(reference, programme(order.scene), made, seed=order.seed):
+        unfinished = Path(hidden) / path.name
+        for _ in observe(reference, programme(order.scene), unfinished, seed=order.seed):
             pass
-        truth_path(made).replace(truth_path(path))
-        made.replace(path)
+        truth_path(unfinished).replace(truth_path(path))
+        unfinished.replace(path)
 
 
-def _is_whole(order: _Order) -> bool:
-    """Whether the recording and its truth are there.
+def _is_complete(order: _Order) -> bool:
+    """Return whether the recording and its truth exist.
 
     Raises:
-        OutputError: the file is another recording, or none.
+        OutputError: the file is another recording, or no recording.
     """
     if not order.path.exists():
         return False
     remedy = "Choose another folder or pass --overwrite."
     try:
         records = iterate_records(order.path)
-        said = next((one.metadata for one in records if isinstance(one, Metadata) and one.name == METADATA), {})
+        metadata = next((r.metadata for r in records if isinstance(r, Metadata) and r.name == METADATA), {})
     except RecordingError as failure:
-        raise OutputError(f"the place of seed {order.seed} is taken: {failure} {remedy}") from failure
-    if said.get("identity") != recording_identity(order.scene, order.sensing, order.seed):
-        asked = {"name": order.scene.name, "sensing": order.sensing, "seed": str(order.seed)}
-        found = {key: said.get(key, "unknown") for key in asked}
-        why = "a scene of that name with other contents or disturbances" if found == asked else f"{found}, not {asked}"
-        raise OutputError(f"{order.path} is of {why}. {remedy}")
+        raise OutputError(f"seed {order.seed} has another file in its place: {failure} {remedy}") from failure
+    if metadata.get("identity") != recording_identity(order.scene, order.sensing, order.seed):
+        requested = {"name": order.scene.name, "sensing": order.sensing, "seed": str(order.seed)}
+        found = {key: metadata.get(key, "unknown") for key in requested}
+        same_name = "a scene of that name with other contents or disturbances"
+        what = same_name if found == requested else f"{found}, not {requested}"
+        raise OutputError(f"{order.path} is a recording of {what}. {remedy}")
     return truth_path(order.path).exists()

@@ -1,7 +1,7 @@
-"""Triangles over a nearly flat sheet of points, and its continuation beyond what was measured.
+"""Triangulation of a nearly flat sheet of points, and its continuation beyond the measured points.
 
-Delaunay in the best-fit plane, long and thin triangles of the outline removed. For sheets that fold over themselves in
-that plane it is wrong; measured faces are then needed.
+Delaunay triangulation in the best-fit plane, without the long and thin triangles of the outline. It is wrong for a
+sheet that folds over itself in that plane, which needs measured faces.
 """
 
 from dataclasses import dataclass
@@ -10,24 +10,27 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import Delaunay, KDTree
 
-THIN = 0.25
-"""Outline triangles are dropped below this twice the area over the longest edge squared (equilateral .87)."""
+MIN_OUTLINE_SHAPE = 0.25
+"""Twice the area over the longest edge squared below which an outline triangle is dropped (equilateral: 0.87)."""
 CLEARANCE = 0.6
-"""Lattice points nearer than this many spacings to a measured point are left out."""
+"""Distance to a measured point below which a lattice point is left out [spacings]."""
+END_SHARE, END_SPACINGS = 0.1, 1.5
+"""Length of the end zone that gives the width of a strip: a share of the measured length, and at least so many
+spacings, so that one unseen corner does not narrow the sheet."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SheetPlane:
-    """Coordinates in a sheet: along an axis, across it, and above."""
+    """Coordinates in a sheet: along an axis, across it, and above it."""
 
     centre: Float[np.ndarray, " 3"]
-    """[m]."""
+    """Origin of the coordinates in the world frame [m]."""
     axes: Float[np.ndarray, "3 3"]
-    """Rows: along, across, above; right-handed, of unit length, above towards world +z."""
+    """Unit vectors along, across, above as rows; right-handed, `above` towards world +z."""
 
     @classmethod
     def through(cls, points: Float[np.ndarray, "m 3"], axis: Float[np.ndarray, " 3"] | None = None) -> "SheetPlane":
-        """The best-fit plane of finite points; with an axis, the best one that holds it."""
+        """Return the best-fit plane of finite points; with an axis, the best one that contains it."""
         centre = points.mean(axis=0)
         rest = points - centre
         along = np.linalg.svd(rest, full_matrices=False)[2][0] if axis is None else axis
@@ -37,33 +40,34 @@ class SheetPlane:
         return cls(centre=centre, axes=np.stack([along, across, np.cross(along, across)]))
 
     def flatten(self, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 2"]:
-        """Coordinates along and across [m]."""
+        """Return the coordinates along and across of world points [m]."""
         return (points - self.centre) @ self.axes[:2].T
 
     def raise_up(self, flat: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 3"]:
-        """World points of the plane [m]."""
+        """Return the world points of coordinates in the plane [m]."""
         return self.centre + flat @ self.axes[:2]
 
     def along(self, station: float) -> float:
-        """Coordinate along the axis of a station [m].
+        """Return the coordinate along the axis of a station [m].
 
-        A station is a world coordinate, x, y or z, whichever the axis follows most closely, read on the centre line.
+        A station is the world coordinate x, y or z, whichever the axis follows most closely, of a point on the centre
+        line.
         """
         k = int(np.argmax(np.abs(self.axes[0])))
         return float((station - self.centre[k]) / self.axes[0, k])
 
     def beyond(self, points: Float[np.ndarray, "m 3"], station: float) -> Bool[np.ndarray, " m"]:
-        """Which points lie at a station or farther from the centre than it."""
+        """Return which points lie at a station or farther from the centre than it."""
         limit, along = self.along(station), (points - self.centre) @ self.axes[0]
         return along >= limit if limit > 0 else along <= limit
 
 
 def triangulate(flat: Float[np.ndarray, "m 2"], longest_edge: float) -> Int[np.ndarray, "f 3"]:
-    """Delaunay triangles, all the same way round, without the long and thin ones of a ragged outline.
+    """Return Delaunay triangles of one orientation, without the long and thin ones of a ragged outline.
 
     Args:
         flat: points in the plane [m].
-        longest_edge: triangles with a longer edge are dropped [m].
+        longest_edge: length above which an edge's triangles are dropped [m].
     """
     faces = Delaunay(flat).simplices.astype(np.int64)
     corners = flat[faces]
@@ -71,7 +75,8 @@ def triangulate(flat: Float[np.ndarray, "m 2"], longest_edge: float) -> Int[np.n
     signed = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
     faces[signed < 0] = faces[signed < 0][:, ::-1]
     longest = np.sqrt((edges**2).sum(axis=2).max(axis=1))
-    faces, thin = faces[longest <= longest_edge], (np.abs(signed) < THIN * longest**2)[longest <= longest_edge]
+    thin, short = np.abs(signed) < MIN_OUTLINE_SHAPE * longest**2, longest <= longest_edge
+    faces, thin = faces[short], thin[short]
     while True:
         ordered = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         _, inverse, count = np.unique(ordered, axis=0, return_inverse=True, return_counts=True)
@@ -82,21 +87,20 @@ def triangulate(flat: Float[np.ndarray, "m 2"], longest_edge: float) -> Int[np.n
 
 
 def extend(flat: Float[np.ndarray, "m 2"], *, begin: float, end: float, spacing: float) -> Float[np.ndarray, "k 2"]:
-    """Lattice points that continue a strip's outline along its axis, clear of the measured points.
+    """Return lattice points that continue a strip's outline along its axis, clear of the measured points.
 
-    The width at either end is that of the measured points in the outermost tenth of their length, and in no less than
-    1.5 spacings, so that one unseen corner does not narrow the sheet.
+    The width at either end is that of the measured points in the end zone (`END_SHARE`, `END_SPACINGS`).
 
     Args:
         flat: measured points, along and across [m].
-        begin: where the sheet begins along the axis [m].
-        end: where it ends [m].
-        spacing: of the lattice [m].
+        begin: coordinate along the axis at which the sheet begins [m].
+        end: coordinate at which it ends [m].
+        spacing: spacing of the lattice [m].
     """
     first, last = flat[:, 0].min(), flat[:, 0].max()
-    zone = max(0.1 * (last - first), 1.5 * spacing)
+    zone = max(END_SHARE * (last - first), END_SPACINGS * spacing)
     pieces = [np.empty((0, 2))]
-    for edge, stop, near in (
+    for edge, stop, in_zone in (
         (first, begin, flat[:, 0] <= first + zone),
         (last, end, flat[:, 0] >= last - zone),
     ):
@@ -104,13 +108,13 @@ def extend(flat: Float[np.ndarray, "m 2"], *, begin: float, end: float, spacing:
         length = outward * (stop - edge)
         if length <= 0:
             continue
-        low, high = flat[near, 1].min(), flat[near, 1].max()
+        low, high = flat[in_zone, 1].min(), flat[in_zone, 1].max()
         n_rows = max(1, round(length / (spacing * np.sqrt(3) / 2)))
         n_across = max(1, round((high - low) / spacing))
         for row in range(n_rows + 1):
-            even = np.linspace(low, high, n_across + 1)
-            odd = np.concatenate([[low], 0.5 * (even[1:] + even[:-1]), [high]])
-            across = even if (n_rows - row) % 2 == 0 else odd
+            on_lattice = np.linspace(low, high, n_across + 1)
+            shifted = np.concatenate([[low], 0.5 * (on_lattice[1:] + on_lattice[:-1]), [high]])
+            across = on_lattice if (n_rows - row) % 2 == 0 else shifted
             pieces.append(np.column_stack([np.full(len(across), edge + outward * length * row / n_rows), across]))
     lattice = np.concatenate(pieces)
     return lattice[KDTree(flat).query(lattice)[0] >= CLEARANCE * spacing]

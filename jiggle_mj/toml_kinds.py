@@ -1,6 +1,6 @@
-"""Tables of a TOML file read strictly: every key has a kind, and a key that nobody asked for is an error.
+"""Strict reading of TOML tables: every key has a kind, and an unknown key is an error.
 
-A kind is a function that returns the value, or raises `TypeError` with the words for what it must be.
+A kind is a function that returns the value, or raises `TypeError` with the description of an allowed value.
 """
 
 import math
@@ -13,19 +13,20 @@ from jaxtyping import Float
 from .errors import RecordingError
 
 REQUIRED = object()
+"""Default of a key without a default."""
 
 
 class StrictTable:
-    """A table of the TOML file that knows which of its keys were asked for."""
+    """A table of a TOML file that remembers which of its keys were read."""
 
     def __init__(self, values: dict[str, Any], where: str, *, given: bool = True) -> None:
         self.values, self.where, self.given, self.known = values, where, given, set[str]()
 
     def take(self, key: str, kind: Callable[[Any], Any], default: Any = REQUIRED) -> Any:
-        """The value of a key, or the default where it is not there.
+        """Return the value of a key, or the default where the key is missing.
 
         Raises:
-            RecordingError: missing without a default, or not of that kind.
+            RecordingError: the key is missing without a default, or its value is not of that kind.
         """
         self.known.add(key)
         if key not in self.values:
@@ -38,25 +39,25 @@ class StrictTable:
             raise RecordingError(f"{self.where} {key} must be {failure}; got {self.values[key]!r}.") from failure
 
     def table(self, key: str, *, optional: bool = False) -> "StrictTable":
-        """The table under a key; an optional one that is missing is empty."""
+        """Return the table under a key; an optional table that is missing is empty."""
         values = self.take(key, table, {} if optional else REQUIRED)
         path = self.where.partition(" [")[2].rstrip("]")
         inner = f"{path}.{key}" if path else key
         return StrictTable(values, f"{self.where.partition(' [')[0]} [{inner}]", given=key in self.values)
 
     def direction(self, key: str) -> Float[np.ndarray, " 3"]:
-        """The unit vector along a key's three numbers."""
+        """Return the unit vector along a key's three numbers."""
         given = np.array(self.take(key, vector))
         length = np.linalg.norm(given)
         if not length > 0:
-            raise RecordingError(f"{self.where} {key} must have a direction; got {given.tolist()}.")
+            raise RecordingError(f"{self.where} {key} must be a vector that is not zero; got {given.tolist()}.")
         return given / length
 
     def refuse_unknown(self) -> None:
-        """Refuse the keys that nobody has taken.
+        """Refuse keys that were not read.
 
         Raises:
-            RecordingError: naming the first, and all that are known.
+            RecordingError: a key is unknown; names the first one, and all known keys.
         """
         unknown = sorted(set(self.values) - self.known)
         if unknown:
@@ -66,70 +67,70 @@ class StrictTable:
 
 
 def text(value: Any) -> str:
-    """A string."""
+    """Return a string."""
     if not isinstance(value, str):
         raise TypeError("a text")
     return value
 
 
 def texts(value: Any) -> tuple[str, ...]:
-    """A list of strings."""
+    """Return a list of strings as a tuple."""
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
         raise TypeError("a list of texts")
     return tuple(value)
 
 
 def flag(value: Any) -> bool:
-    """True or false."""
+    """Return true or false."""
     if not isinstance(value, bool):
         raise TypeError("true or false")
     return value
 
 
 def number(value: Any) -> float:
-    """A finite number."""
+    """Return a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise TypeError("a number")
     return float(value)
 
 
 def positive(value: Any) -> float:
-    """A finite number above 0."""
+    """Return a finite number above 0."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
         raise TypeError("a number above 0")
     return float(value)
 
 
 def count(value: Any) -> int:
-    """A whole number from 0."""
+    """Return an integer of at least 0."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise TypeError("a whole number from 0")
     return value
 
 
 def counts(value: Any) -> list[int]:
-    """A list of whole numbers from 0."""
+    """Return a list of integers of at least 0."""
     if not isinstance(value, list):
         raise TypeError("a list of whole numbers")
     return [count(item) for item in value]
 
 
 def vector(value: Any) -> list[float]:
-    """Three numbers."""
+    """Return three numbers."""
     if not isinstance(value, list) or len(value) != 3:
         raise TypeError("three numbers")
     return [number(item) for item in value]
 
 
 def matrix(value: Any) -> list[list[float]]:
-    """Three rows of three numbers."""
+    """Return three rows of three numbers."""
     if not isinstance(value, list) or len(value) != 3:
         raise TypeError("three rows of three numbers")
     return [vector(row) for row in value]
 
 
 def table(value: Any) -> dict[str, Any]:
-    """A table, as it is."""
+    """Return a table as it is."""
     if not isinstance(value, dict):
         raise TypeError("a table")
     return value

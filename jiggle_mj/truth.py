@@ -1,6 +1,7 @@
-"""What the reference knows and the estimator must not: the true attachments and positions.
+"""The true attachments and positions, which the estimator must not see.
 
-Lives in a file of its own (`run.truth.mcap`). Only `jiggle_mj.eval` reads it; whoever makes the tissue writes it.
+They are stored in a separate file (`run.truth.mcap`). The reference tissue or an importer writes it; only
+`jiggle_mj.eval` reads it.
 """
 
 from dataclasses import dataclass
@@ -11,12 +12,12 @@ from jaxtyping import Bool, Float, Int
 
 @dataclass(frozen=True, kw_only=True)
 class TruthFrame:
-    """The tissue at one observation."""
+    """True state of the tissue at one observation."""
 
     index: int
-    """The observation's index."""
+    """Index of the observation."""
     time: int
-    """[ns]."""
+    """Time of the observation [ns]."""
     positions: Float[np.ndarray, "n 3"]
     """True positions of the reference's vertices, on the surface that a camera sees [m]; NaN where unknown."""
     stiffness: Float[np.ndarray, " n"]
@@ -24,22 +25,24 @@ class TruthFrame:
     tip: Float[np.ndarray, " 3"]
     """True tip position [m]."""
     load: Float[np.ndarray, " n"] | None = None
-    """Force that each vertex's attachment carries [N], 0 where free; None where unknown."""
+    """Force on each vertex's attachment [N], 0 where free; None where unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """The reference's mesh, attachments and frames."""
+    """Mesh, attachments and frames of the reference tissue."""
 
     rest: Float[np.ndarray, "n 3"]
     """Rest positions on the visible surface [m]."""
     faces: Int[np.ndarray, "f 3"]
+    """Vertex numbers of each triangle, from 0."""
     attached: Bool[np.ndarray, " n"]
     """Which vertices are attached at the start."""
     frames: tuple[TruthFrame, ...]
+    """True state at each observation; empty for measured data."""
     scene: str
     """Name of the scene or recording."""
     identity: str = ""
-    """Of the recording that this is the truth of, as its metadata has it; empty where unknown."""
+    """Identity of the recording that this truth belongs to, as its metadata has it; empty where unknown."""
     details: dict[str, object]
-    """Whatever else the maker wants on record (the scene as typed, disturbances), JSON-serialisable."""
+    """Further entries of the writer (the scene as typed, disturbances), JSON-serialisable."""

@@ -1,8 +1,8 @@
-"""Processes that work side by side, each of which may die without taking the others with it.
+"""An executor of parallel processes, each of which may die without stopping the others.
 
-`concurrent.futures.ProcessPoolExecutor` stops all its processes when one of them dies, and is of no use from then on.
-Here the dead process loses the one call that it was at, and the next call gets a new process. Processes are spawned:
-neither OpenGL nor JAX survives a fork.
+`concurrent.futures.ProcessPoolExecutor` stops all its processes when one of them dies, and accepts no further calls.
+Here only the call of the dead process fails, and the next call gets a new process. Processes are spawned: neither
+OpenGL nor JAX survives a fork.
 """
 
 import multiprocessing
@@ -25,21 +25,21 @@ SPAWN = multiprocessing.get_context("spawn")
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
+    """Return the number of cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class WorkerProcesses(Executor):
-    """An executor of processes; leaving its `with` by an exception stops them at once, else the calls are waited for.
+    """An executor of processes; leaving its `with` waits for the calls, and by an exception stops them at once.
 
-    Functions, arguments and results are pickled. As with every spawned process, a script that makes one does so under
+    Functions, arguments and results are pickled. As with every spawned process, a script must create it under
     `if __name__ == "__main__":`. The call whose process dies raises `BrokenExecutor`; it may be submitted again.
 
     Args:
-        count: how many processes at most; None for one on each usable core.
+        count: largest number of processes; None for one on each usable core.
 
     Raises:
-        OptionError: fewer than 1.
+        OptionError: count is below 1.
     """
 
     def __init__(self, count: int | None = None) -> None:
@@ -53,18 +53,18 @@ class WorkerProcesses(Executor):
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker-process")
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Schedule a call."""
+        """Schedule a call and return its future."""
         return self._threads.submit(self._call, fn, args, kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more calls; with `wait`, return when all are done and the processes have ended."""
+        """Accept no further calls; with `wait`, return when all calls are done and the processes have ended."""
         self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
         if wait:
             for worker in self._workers:
                 worker.end()
 
     def stop(self) -> None:
-        """End the processes now; a call under way cleans up as it does after any exception."""
+        """End the processes now; a running call cleans up as after any exception."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         for worker in self._workers:
             worker.terminate()
@@ -85,7 +85,7 @@ class WorkerProcesses(Executor):
 
 
 class _Worker:
-    """One process at a time, started when it is first needed, and anew after it died."""
+    """One process at a time, started when it is first needed, and again after it died."""
 
     def __init__(self) -> None:
         self._running: tuple[SpawnProcess, Connection] | None = None
@@ -93,15 +93,15 @@ class _Worker:
         self._lock = threading.Lock()
 
     def call(self, fn: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any]) -> T:
-        """Have a call carried out there.
+        """Execute a call in the process and return its value.
 
         Raises:
-            BrokenExecutor: the process died, or none is to be started any more.
+            BrokenExecutor: the process died, or the worker was stopped.
         """
-        process, ours = self._started()
+        process, connection = self._started()
         try:
-            ours.send((fn, args, kwargs))
-            returned, value = ours.recv()
+            connection.send((fn, args, kwargs))
+            returned, value = connection.recv()
         except (EOFError, OSError) as death:
             self.end()
             raise BrokenExecutor(f"a worker process died (exit code {process.exitcode})") from death
@@ -110,18 +110,18 @@ class _Worker:
         raise value
 
     def terminate(self) -> None:
-        """End the process, and start none again."""
+        """End the process, and start no other."""
         with self._lock:
             self._stopped = True
             if self._running is not None:
                 self._running[0].terminate()
 
     def end(self) -> None:
-        """Tell the process, by closing its pipe, that nothing more comes, and wait for it."""
+        """Close the pipe, which ends the process, and wait for it."""
         with self._lock:
             if self._running is not None:
-                process, ours = self._running
-                ours.close()
+                process, connection = self._running
+                connection.close()
                 process.join()
                 self._running = None
 
@@ -130,16 +130,16 @@ class _Worker:
             if self._stopped:
                 raise BrokenExecutor("the worker processes have been stopped")
             if self._running is None:
-                ours, theirs = SPAWN.Pipe()
-                process = SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
+                connection, of_process = SPAWN.Pipe()
+                process = SPAWN.Process(target=_serve, args=(of_process,), daemon=True)
                 process.start()
-                theirs.close()
-                self._running = process, ours
+                of_process.close()
+                self._running = process, connection
             return self._running
 
 
 def _serve(connection: Connection) -> None:
-    """Carry out calls until the pipe is closed; SIGTERM ends one as `sys.exit` does, Ctrl-C is the parent's affair."""
+    """Execute calls until the pipe is closed; SIGTERM ends one as `sys.exit` does; the parent handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:

@@ -1,7 +1,7 @@
-"""The command line: `jiggle-mj VERB`. Results go to files; --json prints them, all else goes to stderr.
+"""The command line: `jiggle-mj VERB`. Results go to files; --json prints them to stdout, all else goes to stderr.
 
-Exit codes: 0 fine, 1 the run failed, 2 bad usage (a scene, an option or an output folder that cannot be used). Heavy
-imports happen inside the verbs, so that help is quick.
+Exit codes: 0 success, 1 the run failed, 2 wrong usage (a scene, an option or an output folder that cannot be used), 130
+Ctrl-C. The verbs import heavy packages inside, so that help is quick.
 """
 
 import tyro
@@ -12,7 +12,7 @@ from .checks import bench, doctor, scene_check
 from .estimating import close_loop, estimate, identify, run, score
 from .recording import import_, record
 from .tables import table
-from .terminal import stop
+from .terminal import FAILED, INTERRUPTED, WRONG_USAGE, stop
 
 VERBS = {
     "run": run,
@@ -27,20 +27,27 @@ VERBS = {
     "scene-check": scene_check,
     "doctor": doctor,
 }
+"""Verb to the function that it calls."""
 
 
 def main() -> None:
-    """Entry point of `jiggle-mj`."""
+    """Run the verb that the command line names, and exit with its code."""
     keep_freed_memory()
     try:
         tyro.extras.subcommand_cli_from_dict(
             VERBS,
             prog="jiggle-mj",
-            description="Find where a tissue is attached, how strongly and how surely, from pulls seen by a camera.",
+            description=(
+                "Estimate where a tissue sheet is attached, how stiff each attachment is and how certain that is, from "
+                "pulls of a tweezer that a stereo camera sees."
+            ),
         )
     except (SceneError, OptionError, OutputError) as failure:
-        stop(failure, 2)
+        stop(failure, WRONG_USAGE)
     except JiggleError as failure:
-        stop(failure, 1)
+        stop(failure, FAILED)
     except KeyboardInterrupt:
-        stop("interrupted; the recording so far is whole, and 'jiggle-mj estimate' reads it into another folder", 130)
+        stop(
+            "interrupted; the recording so far is complete, and 'jiggle-mj estimate' reads it into another folder",
+            INTERRUPTED,
+        )

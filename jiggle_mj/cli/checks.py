@@ -1,4 +1,4 @@
-"""`bench`, `scene-check` and `doctor`: how fast, how stiff, and what this machine lacks."""
+"""The verbs `bench`, `scene-check` and `doctor`: speed, stiffness of a scene, and requirements of this machine."""
 
 import json
 import sys
@@ -21,14 +21,16 @@ def bench(
     gate: bool = False,
     as_json: AsJson = False,
 ) -> None:
-    """Time the estimator's or the reference tissue's parts on this machine, compile time apart; medians.
+    """Measure the speed of the estimator or of the reference tissue on this machine.
+
+    Prints the median time of each part; compile time is separate.
 
     Args:
-        part: estimator, or reference.
-        sizes: about how many particles (600, 1200 if left out; the first is compared with the paper's filter too, and
-            of more than 10000 the solver is timed alone), or vertices of the reference (300, 625, 1200, 2500).
-        gate: fail where something became worse than the committed baseline allows.
-        as_json: print the figures to stdout.
+        part: what to time: the estimator, or the reference tissue.
+        sizes: approximate numbers of particles (default 600 1200; the first is also run with the paper's filter, and
+            above 10000 only the solver is timed), or of the reference's vertices (default 300 625 1200 2500).
+        gate: exit with 1 where a figure is worse than the committed baseline allows.
+        as_json: print the figures to stdout as JSON.
     """
     from jiggle_mj.eval.benchmark.estimator_benchmark import SIZES, baseline, benchmark, regressions
 
@@ -53,42 +55,46 @@ def bench(
 
 
 def scene_check(scene: Name, /, *, disturb: Disturb = (), as_json: AsJson = False) -> None:
-    """Static load tests of a scene's compiled sheet: its stiffness beside the typed and the declared one.
+    """Measure the stiffness of a scene's compiled sheet by static load tests.
+
+    Prints it beside the stiffness in the scene file and the one that is declared to the estimator.
 
     Args:
-        scene: a shipped scene or the path of a scene file.
-        disturb: see run; those of the material that begin at 0 count.
-        as_json: print the figures to stdout.
+        scene: name of a shipped scene, or path of a scene file.
+        disturb: a disturbance, as in run; only those of the material that begin at 0 have an effect.
+        as_json: print the figures to stdout as JSON.
     """
     from jiggle_mj.scenes import disturbed, load_scene
     from jiggle_mj.scenes.load_tests import QUANTITIES, far_from_declared, load_tests, typed
 
-    loaded = disturbed(load_scene(scene), disturb)
+    scene_to_test = disturbed(load_scene(scene), disturb)
     with console.status("load tests") as status:
-        found = load_tests(loaded, log=lambda text: status.update(f"load tests: {text}"))
-    stated = typed(loaded.tissue)
-    spacings = [f"{1e3 * one.spacing:.2f} mm" for one in found]
+        measured = load_tests(scene_to_test, log=lambda text: status.update(f"load tests: {text}"))
+    nominal = typed(scene_to_test.tissue)
+    spacings = [f"{1e3 * test.spacing:.2f} mm" for test in measured]
     table = Table("effective", "unit", "typed", *spacings, box=None)
     for name, unit in QUANTITIES.items():
-        ratios = ["too coarse" if isnan(value := getattr(one, name)) else f"{value:.4g}" for one in found]
-        table.add_row(name.replace("_", " "), unit, f"{getattr(stated, name):.4g}", *ratios)
+        ratios = ["too coarse" if isnan(value := getattr(test, name)) else f"{value:.4g}" for test in measured]
+        table.add_row(name.replace("_", " "), unit, f"{getattr(nominal, name):.4g}", *ratios)
     console.print(table)
-    for line in far_from_declared(loaded, found):
+    for line in far_from_declared(scene_to_test, measured):
         console.print(line, style="yellow", markup=False, highlight=False)
     if as_json:
-        plain = [{key: None if isnan(value) else value for key, value in asdict(one).items()} for one in found]
-        print(json.dumps({"typed": asdict(stated), "effective": plain}))
+        plain = [{key: None if isnan(value) else value for key, value in asdict(test).items()} for test in measured]
+        print(json.dumps({"typed": asdict(nominal), "effective": plain}))
 
 
 def doctor(*, as_json: AsJson = False) -> None:
-    """Check this machine: versions, JAX devices, offscreen OpenGL, cores and memory.
+    """Check that this machine can run jiggle-mj, and print what to do where it cannot.
+
+    Checks package versions, JAX devices, offscreen OpenGL, cores and memory.
 
     Args:
-        as_json: print the checks to stdout.
+        as_json: print the checks to stdout as JSON.
     """
-    from ..doctor import doctor as examine
+    from ..doctor import doctor as run_checks
 
-    checks = examine()
+    checks = run_checks()
     table = Table("", "check", "found", "what to do", box=None)
     for check in checks:
         table.add_row("[green]ok[/]" if check.ok else "[red]no[/]", check.name, check.detail, check.remedy or "")

@@ -1,4 +1,4 @@
-"""`run`, `estimate`, `identify`, `close-loop` and `score`: what looks for attachments, and for what the model lacks."""
+"""The verbs `run`, `estimate`, `identify`, `close-loop` and `score`: estimation, model errors and scores."""
 
 import json
 from dataclasses import asdict
@@ -8,7 +8,7 @@ from rich.table import Table
 
 from ..options import FilterName, PolicyName, Sensing
 from .options import AsJson, Disturb, Name, Out, PathArgument
-from .terminal import console, patient, progress, show, stop
+from .terminal import INTERRUPTED, console, patient, progress, show, stop
 
 
 def run(
@@ -25,22 +25,24 @@ def run(
     overwrite: bool = False,
     as_json: AsJson = False,
 ) -> None:
-    """The main job: reference tissue, stereo, estimate, score, report.
+    """Simulate a scene, estimate where its tissue is attached, score the estimate and write a report.
 
     Args:
-        scene: a shipped scene (arc, line, ...) or the path of a scene file.
+        scene: name of a shipped scene (arc, line, ...), or path of a scene file.
         out: folder for run.mcap, run.truth.mcap, estimate.mcap, result.json and report.html.
-        sensing: what the estimator sees: images; noisy tracked points of the tissue; noisy vertices of the reference; a
-            noisy cloud of other points in each frame.
-        policy: who chooses the pulls, if not whom the scene names: corners is its programme; information is ours,
-            one-grasp is ours without letting go; detach cuts what it finds, suture sews; sl-d, lg-d, lg-h and pmp-WAY
-            are the paper's, which move one grasp.
-        steps: how many actions a policy may take: 40 if left out, 400 of detach and suture.
-        estimator: implicit is ours; explicit is the paper's filter, adam its baseline; nnls and unscented are others'.
-        seed: of the sensing noise.
-        disturb: something that nobody tells the estimator of, such as gravity=0.5; any number of times. The names are
-            in docs/DISTURBANCES.md.
-        overwrite: replace results that are already in the folder, from the moment that the run begins.
+        sensing: what the estimator sees: stereo images; noisy tracked points of the tissue; noisy vertices of the
+            reference mesh (particles); a noisy cloud of other points in each frame.
+        policy: policy that chooses the pulls; the one that the scene names if left out. corners pulls as the scene's
+            programme says; information chooses informative pulls, one-grasp does so without a second grasp; detach
+            cuts the attachments that it finds, suture sews; sl-d, lg-d, lg-h and pmp-DIRECTION are the paper's, which
+            move one grasp.
+        steps: largest number of actions of a policy; 40 if left out, 400 for detach and suture.
+        estimator: implicit is ours; explicit is the paper's filter and adam the paper's baseline; nnls and unscented
+            are further baselines.
+        seed: seed of the sensing noise.
+        disturb: a disturbance that the estimator is not told of, such as gravity=0.5; may be repeated.
+            docs/DISTURBANCES.md lists the names.
+        overwrite: replace the results in the folder; they are removed when the run begins.
         as_json: print result.json to stdout.
     """
     from jiggle_mj.estimator import EstimatorConfig
@@ -48,10 +50,11 @@ def run(
     from jiggle_mj.eval.runs.experiment import run_scene
     from jiggle_mj.scenes import disturbed, load_scene
 
-    loaded, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)
-    with patient() as stopped, progress(most_actions(loaded, policy, steps), f"run {loaded.name}") as on_frame:
+    scene_to_run, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)
+    n_actions = most_actions(scene_to_run, policy, steps)
+    with patient() as stopped, progress(n_actions, f"run {scene_to_run.name}") as on_frame:
         figures = run_scene(
-            loaded,
+            scene_to_run,
             out,
             seed=seed,
             sensing=sensing,
@@ -64,7 +67,7 @@ def run(
         )
     show(figures, out, as_json)
     if stopped():
-        stop(f"interrupted; what was seen until then is in {out}", 130)
+        stop(f"interrupted; the results until then are in {out}", INTERRUPTED)
 
 
 def estimate(
@@ -77,14 +80,15 @@ def estimate(
     overwrite: bool = False,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate from a recording, which holds observations only.
+    """Estimate where the tissue is attached from a recording, simulated or real, and write a report.
 
     Args:
-        recording: an MCAP file.
+        recording: an MCAP file of observations.
         out: folder for estimate.mcap, result.json and report.html.
-        estimator: implicit is ours; explicit is the paper's filter, adam its baseline; nnls and unscented are others'.
-        allow_truncated: use what is whole of a recording that was cut off.
-        overwrite: replace results that are already in the folder.
+        estimator: implicit is ours; explicit is the paper's filter and adam the paper's baseline; nnls and unscented
+            are further baselines.
+        allow_truncated: use the complete frames of a recording that was cut off.
+        overwrite: replace the results in the folder.
         as_json: print result.json to stdout.
     """
     from jiggle_mj.estimator import EstimatorConfig
@@ -106,12 +110,12 @@ def estimate(
 
 
 def identify(recording: PathArgument, /, *, allow_truncated: bool = False, as_json: AsJson = False) -> None:
-    """Weight and bending stiffness of the sheet over its membrane stiffness, from a recording.
+    """Identify the sheet's weight and bending stiffness, relative to its membrane stiffness, from a recording.
 
     Args:
-        recording: an MCAP file.
-        allow_truncated: use what is whole of a recording that was cut off.
-        as_json: print what was found to stdout.
+        recording: an MCAP file of observations.
+        allow_truncated: use the complete frames of a recording that was cut off.
+        as_json: print the ratios, the refusals and the resulting declaration to stdout as JSON.
     """
     from jiggle_mj.estimator import Estimator
 
@@ -126,24 +130,24 @@ def identify(recording: PathArgument, /, *, allow_truncated: bool = False, as_js
         material = estimator.identify(
             on_pass=lambda factors: status.update(", ".join(f"{name} x {x:.3g}" for name, x in factors.items()))
         )
-    table = Table("over the membrane stiffness", "unit", "declared", "found", "standard error", box=None)
+    table = Table("over the membrane stiffness", "unit", "declared", "identified", "standard error", box=None)
     for name, ratio in material.ratios.items():
-        known = ratio.refused is None
-        found = (f"{ratio.declared * ratio.factor:.3g}", f"{100 * ratio.log_sd:.1f} %") if known else ("-", "-")
-        table.add_row(name, ratio.unit, f"{ratio.declared:.3g}", *found)
+        reliable = ratio.refused is None
+        cells = (f"{ratio.declared * ratio.factor:.3g}", f"{100 * ratio.log_sd:.1f} %") if reliable else ("-", "-")
+        table.add_row(name, ratio.unit, f"{ratio.declared:.3g}", *cells)
     console.print(table)
     for name, why in material.refused.items():
         console.print(f"{name}: not identified; {why}.", highlight=False)
-    found = material.declaration
+    declaration = material.declaration
     console.print(
-        f"If the sheet weighs the declared {found.areal_density:g} kg/m^2: membrane_stiffness = "
-        f"{found.membrane_stiffness:.3g} N/m, and thickness = {found.thickness:.3g} m for its bending.",
+        f"If the sheet weighs the declared {declaration.areal_density:g} kg/m^2: membrane_stiffness = "
+        f"{declaration.membrane_stiffness:.3g} N/m, and thickness = {declaration.thickness:.3g} m for its bending.",
         highlight=False,
     )
     if as_json:
         ratios = {name: asdict(ratio) for name, ratio in material.ratios.items()}
-        declared = {name: getattr(found, name) for name in ("membrane_stiffness", "thickness", "areal_density")}
-        print(json.dumps({"ratios": ratios, "refused": material.refused, "declaration": declared}))
+        identified = {name: getattr(declaration, name) for name in ("membrane_stiffness", "thickness", "areal_density")}
+        print(json.dumps({"ratios": ratios, "refused": material.refused, "declaration": identified}))
 
 
 def close_loop(
@@ -157,15 +161,15 @@ def close_loop(
     overwrite: bool = False,
     as_json: AsJson = False,
 ) -> None:
-    """What the model lacks of a recording: the residual, the effect behind it, and the error before and after.
+    """Find which physical effect the model lacks for a recording, refit with it, and report the error before and after.
 
     Args:
-        recording: an MCAP file.
+        recording: an MCAP file of observations.
         out: folder for discrepancy.json and discrepancy.html.
-        truth: a truth file, to score what is found attached before and after; opened when all is decided.
-        suggest: where several effects explain the frames, look for the next pull that tells them apart.
-        allow_truncated: use what is whole of a recording that was cut off.
-        overwrite: replace results that are already in the folder.
+        truth: a truth file, to score the detected attachments before and after; it is read after the verdict.
+        suggest: where several effects explain the frames, search the next pull that discriminates between them.
+        allow_truncated: use the complete frames of a recording that was cut off.
+        overwrite: replace the results in the folder.
         as_json: print discrepancy.json to stdout.
     """
     from jiggle_mj.eval.report.discrepancy_page import story
@@ -176,7 +180,7 @@ def close_loop(
 
     length = len(Recording.open(recording, allow_truncated=allow_truncated))
     with progress(length, f"follow {recording.name}") as on_frame:
-        found = close(
+        discrepancy = close(
             recording,
             out,
             truth=truth,
@@ -186,22 +190,22 @@ def close_loop(
             on_frame=on_frame,
             log=lambda text: console.print(text, highlight=False, markup=False),
         )
-    console.print(found["verdict"], style="bold")
-    for sentence in story(found):
+    console.print(discrepancy["verdict"], style="bold")
+    for sentence in story(discrepancy):
         console.print(sentence, highlight=False, markup=False)
     console.print(f"report: {out / PAGE}")
     if as_json:
-        print(json.dumps(found))
+        print(json.dumps(discrepancy))
 
 
 def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = None, as_json: AsJson = False) -> None:
-    """Score an estimate against a truth file, and write the truth into its report.
+    """Score an estimate against the true attachments, and add them to its report.
 
     Args:
-        directory: a folder that `run` or `estimate` filled.
+        directory: output folder of `run` or `estimate`.
         truth: the truth file, for example run.truth.mcap.
-        recording: what was estimated, for the report's pictures; if left out, it is looked for beside the truth and in
-            the folder.
+        recording: the recording that was estimated, for the pictures of the report; if left out, it is searched beside
+            the truth and in the folder.
         as_json: print result.json to stdout.
     """
     from jiggle_mj.eval.runs.experiment import score_directory

@@ -1,4 +1,4 @@
-"""Options that several verbs have, as tyro reads them."""
+"""Options that several verbs share, as tyro reads them."""
 
 from pathlib import Path
 from typing import Annotated, Literal

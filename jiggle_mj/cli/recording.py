@@ -1,4 +1,4 @@
-"""`record` and `import`: what makes recordings."""
+"""The verbs `record` and `import`, which make recordings."""
 
 import json
 import sys
@@ -11,7 +11,7 @@ import tyro
 from ..errors import OptionError
 from ..options import Sensing
 from .options import AsJson, Disturb, Name, Out, PathArgument
-from .terminal import bar, console, progress, stop
+from .terminal import FAILED, INTERRUPTED, bar, console, progress, stop
 
 if TYPE_CHECKING:
     from jiggle_mj.scenes import Scene
@@ -31,21 +31,24 @@ def record(
     overwrite: bool = False,
     as_json: AsJson = False,
 ) -> None:
-    """The reference tissue alone: observations to OUT, the truth to a file of its own beside it.
+    """Simulate the reference tissue and record what the sensors see, without estimating.
+
+    The truth goes to a separate file beside the recording.
 
     Args:
-        scene: a shipped scene or the path of a scene file.
-        out: the recording, for example run.mcap; the truth goes to run.truth.mcap. With --count a folder, in which each
-            recording is named by its seed; what is whole there is kept.
-        sensing: what is recorded.
-        seed: of the sensing noise; with --count of the first recording, the next has the next.
-        count: how many recordings.
-        jobs: how many at a time, each in a process of its own; as many as there are usable cores if left out.
-        executor: a Dask scheduler whose workers record instead, into a folder that all of them share.
-        disturb: something that nobody tells the estimator of, such as gravity=0.5; any number of times. The names are
-            in docs/DISTURBANCES.md.
-        overwrite: replace files that are already there.
-        as_json: print what was written to stdout.
+        scene: name of a shipped scene, or path of a scene file.
+        out: the recording to write, for example run.mcap; the truth goes to run.truth.mcap. With --count a folder, in
+            which each recording is named by its seed; complete recordings in it are kept.
+        sensing: what is recorded: stereo images; noisy tracked points of the tissue; noisy vertices of the reference
+            mesh (particles); a noisy cloud of other points in each frame.
+        seed: seed of the sensing noise; with --count the seed of the first recording, and each further one adds 1.
+        count: number of recordings.
+        jobs: number of parallel processes; the number of usable cores if left out.
+        executor: Dask scheduler whose workers record instead, into a folder that all of them share.
+        disturb: a disturbance that the estimator is not told of, such as gravity=0.5; may be repeated.
+            docs/DISTURBANCES.md lists the names.
+        overwrite: replace existing files.
+        as_json: print the paths and the number of frames to stdout as JSON.
     """
     from jiggle_mj.scenes import Reference, disturbed, load_scene, programme
 
@@ -53,11 +56,13 @@ def record(
     from ..recording.mcap_files import truth_path
 
     if count is None and (jobs is not None or executor is not None):
-        raise OptionError(f"--{'jobs' if executor is None else 'executor'} is for many recordings: give --count too.")
-    loaded = disturbed(load_scene(scene), disturb)
+        raise OptionError(
+            f"--{'jobs' if executor is None else 'executor'} is for several recordings: give --count as well."
+        )
+    scene_to_record = disturbed(load_scene(scene), disturb)
     if count is not None:
         _record_series(
-            loaded,
+            scene_to_record,
             out,
             count=count,
             jobs=jobs,
@@ -69,11 +74,11 @@ def record(
         )
         return
     with (
-        progress(sum(1 for _ in programme(loaded)), f"record {loaded.name}") as on_frame,
-        Reference(loaded, seed=seed, sensing=sensing, dump_dir=out.parent) as reference,
+        progress(sum(1 for _ in programme(scene_to_record)), f"record {scene_to_record.name}") as on_frame,
+        Reference(scene_to_record, seed=seed, sensing=sensing, dump_dir=out.parent) as reference,
     ):
         n_frames = 0
-        for observation in observe(reference, programme(loaded), out, seed=seed, overwrite=overwrite):
+        for observation in observe(reference, programme(scene_to_record), out, seed=seed, overwrite=overwrite):
             on_frame(observation, None)
             n_frames += 1
     console.print(f"wrote {out}: {n_frames} frames; the truth: {truth_path(out)}")
@@ -93,13 +98,13 @@ def _record_series(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Many recordings of a scene; leaves with 1 where some failed, with 130 after Ctrl-C."""
+    """Record a scene with several seeds; exit with 1 where some failed, with 130 after Ctrl-C."""
     from ..cluster import cluster
     from ..series import record_series
     from ..worker_processes import WorkerProcesses
 
     if jobs is not None and executor is not None:
-        raise OptionError("--jobs is for this machine, --executor for others: give one of them.")
+        raise OptionError("--jobs is for this machine, --executor for other machines: give one of them.")
     try:
         with (
             WorkerProcesses(jobs) if executor is None else cluster(executor) as workers,
@@ -116,18 +121,21 @@ def _record_series(
                 on_done=lambda _: advance(),
             )
     except KeyboardInterrupt:
-        stop(f"interrupted; what is in {folder} is whole, and the same command, without --overwrite, goes on", 130)
-    made = len(series.recordings) - series.n_kept
+        stop(
+            f"interrupted; the recordings in {folder} are complete; the same command, without --overwrite, continues",
+            INTERRUPTED,
+        )
+    n_made = len(series.recordings) - series.n_kept
     console.print(
-        f"{folder}: {made} recordings made, {series.n_kept} kept, {len(series.failed)} failed", soft_wrap=True
+        f"{folder}: {n_made} recordings made, {series.n_kept} kept, {len(series.failed)} failed", soft_wrap=True
     )
-    for one, why in series.failed.items():
-        console.print(f"seed {one} failed: {why}", markup=False, highlight=False, soft_wrap=True)
+    for failed_seed, why in series.failed.items():
+        console.print(f"seed {failed_seed} failed: {why}", markup=False, highlight=False, soft_wrap=True)
     if as_json:
-        failed = [{"seed": one, "why": why} for one, why in series.failed.items()]
+        failed = [{"seed": failed_seed, "why": why} for failed_seed, why in series.failed.items()]
         print(json.dumps({"folder": str(folder), "recordings": [*map(str, series.recordings)], "failed": failed}))
     if series.failed:
-        sys.exit(1)
+        sys.exit(FAILED)
 
 
 def import_(
@@ -139,14 +147,16 @@ def import_(
     overwrite: bool = False,
     as_json: AsJson = False,
 ) -> None:
-    """A folder of measured data into a recording.
+    """Convert a folder of measured points to a recording.
+
+    A recording.toml describes the data: docs/RECORDINGS.md has its keys.
 
     Args:
-        folder: where the data files are.
-        out: the recording to write; what the toml holds as truth goes to a file of its own beside it.
-        recording: the recording.toml that describes the data; the folder's own if left out.
-        overwrite: replace files that are already there.
-        as_json: print a summary to stdout.
+        folder: folder of the data files.
+        out: the recording to write; attachments that the TOML knows go to a separate truth file beside it.
+        recording: the recording.toml; that of the folder if left out.
+        overwrite: replace existing files.
+        as_json: print a summary to stdout as JSON.
     """
     from ..importing.folder import import_folder
 
@@ -154,8 +164,8 @@ def import_(
     for name, why in summary.skipped:
         console.print(f"left out {name}: {why}")
     console.print(
-        f"wrote {summary.recording}: {summary.n_frames} frames of {summary.n_points} points, {summary.n_unseen} times "
-        f"a point was not seen, {summary.n_held} held; truth: {summary.truth or 'none'}"
+        f"wrote {summary.recording}: {summary.n_frames} frames of {summary.n_points} points, {summary.n_unseen} "
+        f"missing points over all frames, {summary.n_held} held; truth: {summary.truth or 'none'}"
     )
     if as_json:
         print(json.dumps(asdict(summary), default=str))

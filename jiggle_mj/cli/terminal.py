@@ -1,4 +1,4 @@
-"""What goes to stderr: progress, figures in a few lines, and why it stopped."""
+"""Output to stderr: progress, a short summary of the figures, and the reason of a failure."""
 
 import json
 import signal
@@ -19,44 +19,46 @@ if TYPE_CHECKING:
     from ..observation import Observation
 
 console = Console(stderr=True)
+FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
+"""Exit codes; 130 is 128 + SIGINT, as a shell has it."""
 
 
 def log(text: str) -> None:
-    """A line about long work."""
+    """Print a line about the progress of long work."""
     console.print(text, highlight=False)
 
 
 def stop(failure: object, code: int) -> NoReturn:
-    """Say why in red, and leave."""
+    """Print the reason in red, and exit with a code."""
     console.print(f"jiggle-mj: {failure}", style="red", markup=False, highlight=False, soft_wrap=True)
     sys.exit(code)
 
 
 @contextmanager
 def patient() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C is noted, for who asks, and what is under way comes to its end; the second stops at once."""
-    noted: list[int] = []
+    """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C raises `KeyboardInterrupt`."""
+    interrupts: list[int] = []
 
-    def note(number: int, _: FrameType | None) -> None:
-        if noted:
+    def on_interrupt(number: int, _: FrameType | None) -> None:
+        if interrupts:
             raise KeyboardInterrupt
-        noted.append(number)
-        log("interrupted: what is under way comes to its end, and the results are written; again stops at once")
+        interrupts.append(number)
+        log("interrupted: finishing the current step and writing the results; press Ctrl-C again to stop at once")
 
-    before = signal.signal(signal.SIGINT, note)
+    previous = signal.signal(signal.SIGINT, on_interrupt)
     try:
-        yield lambda: bool(noted)
+        yield lambda: bool(interrupts)
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)
 
 
 @contextmanager
 def progress(total: int, title: str) -> "Iterator[OnFrame]":
-    """A bar of frames."""
+    """Yield a callback that advances a bar by a frame."""
     with bar(total, title) as advance:
 
-        def on_frame(observation: "Observation", found: "Estimate | None") -> None:
-            note = "" if found is None else f", entropy {found.entropy:.0f} nat"
+        def on_frame(observation: "Observation", estimate: "Estimate | None") -> None:
+            note = "" if estimate is None else f", entropy {estimate.entropy:.0f} nat"
             advance(f": grasp {observation.tool.grasp}{note}")
 
         yield on_frame
@@ -64,15 +66,15 @@ def progress(total: int, title: str) -> "Iterator[OnFrame]":
 
 @contextmanager
 def bar(total: int, title: str) -> Iterator[Callable[..., None]]:
-    """A bar on stderr; what is given is called with a note for each part done."""
+    """Yield a function that advances a bar on stderr by one part, with a note beside it."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task(title, total=total)
-        yield lambda note="": bar.update(task, advance=1, description=title + note)
+    with Progress(*columns, console=console) as shown:
+        task = shown.add_task(title, total=total)
+        yield lambda note="": shown.update(task, advance=1, description=title + note)
 
 
 def show(figures: dict, out: Path, as_json: bool) -> None:
-    """What was found, in a few lines; the whole of it with --json."""
+    """Print a summary of result.json to stderr, and all of it to stdout with --json."""
     from jiggle_mj.eval.report.verdict import doubts
 
     detection, calibration = figures["detection"], figures["calibration"]
@@ -81,10 +83,9 @@ def show(figures: dict, out: Path, as_json: bool) -> None:
     )
     if detection["n_attached"] is not None:
         table = Table("rings", "PCD %", "PUG %", "F1 %", box=None)
-        for rings, one in detection["by_dilation"].items():
-            table.add_row(
-                rings, *("-" if one[name] is None else f"{100 * one[name]:.1f}" for name in ("pcd", "pug", "f1"))
-            )
+        for rings, figure in detection["by_dilation"].items():
+            cells = ("-" if figure[name] is None else f"{100 * figure[name]:.1f}" for name in ("pcd", "pug", "f1"))
+            table.add_row(rings, *cells)
         console.print(table)
         parts = [f"{detection['n_attached']} truly attached"]
         if calibration["nees_attached"] is not None:
@@ -95,7 +96,7 @@ def show(figures: dict, out: Path, as_json: bool) -> None:
     for skipped in figures["frames"]["skipped"]:
         console.print(f"frame {skipped['index']} skipped: {skipped['why']}")
     for index in figures["frames"]["not_converged"]:
-        console.print(f"frame {index}: the search for the sheet's state was cut off; trust it less.")
+        console.print(f"frame {index}: the search for the sheet's state did not converge; trust this frame less.")
     for doubt in doubts(figures):
         console.print(doubt)
     console.print(f"report: {out / 'report.html'}")

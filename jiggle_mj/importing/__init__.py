@@ -1,1 +1,1 @@
-"""Measured data of other formats becomes recordings."""
+"""Importers of measured data: folders of tracked points become recordings."""

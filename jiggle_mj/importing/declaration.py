@@ -1,7 +1,7 @@
-"""`recording.toml`: what the user says of a folder of measured data. The format is in docs/RECORDINGS.md.
+"""`recording.toml`: the user's description of a folder of measured data. The format is in docs/RECORDINGS.md.
 
-Checks keys and kinds only; whether the files bear it out is found in `importing`. Lengths are in metres except in the
-data files themselves, whose unit the file declares.
+Checks keys and kinds of values only; `folder` compares them with the data files. Lengths are in metres except in the
+data files, whose unit the description gives.
 """
 
 import tomllib
@@ -16,124 +16,144 @@ from jaxtyping import Float
 from .. import toml_kinds as kinds
 from ..errors import RecordingError
 from ..observation import Declaration
+from ..recording.schemas import NS_PER_S
 from ..toml_kinds import StrictTable
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+"""Metres in one unit of the data files."""
+MAX_ROTATION_ERROR = 1e-6
+"""Largest entry of R R^T - 1 of a rotation: the rounding of six decimals."""
+DEFAULT_GRASP_RADIUS = 2e-3
+"""Radius of the grip where none is given [m]; without effect where rows or vertices are declared held."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointFiles:
-    """Where the tracked points are."""
+    """The files that hold the tracked points."""
 
     files: tuple[str, ...]
-    """Names or patterns, in the order of time; one .npz holds all frames."""
+    """Names or patterns of the files, in the order of time; one .npz holds all frames."""
     key: str | None = None
-    """Array of the .npz, shape (frames, points, 3)."""
+    """Name of the positions in the .npz, shape (frames, points, 3); None for text files."""
     times: str | None = None
-    """Array of the .npz, shape (frames,): when each was taken [s]; None for one every period."""
+    """Name of the frames' times in the .npz, shape (frames,) [s]; None for frames at a constant period."""
     runs: str | None = None
-    """Array of the .npz, shape (frames,): whole numbers that change where another grasp begins; None for one grasp."""
+    """Name of an array in the .npz, shape (frames,): integers that change where another grasp begins; None for one
+    grasp."""
     columns: tuple[int, ...] = (0, 1, 2)
     """Columns of x, y, z in a text file, from 0."""
     rest: int = 0
-    """Number of the rest frame among all, from 0; it is written first."""
+    """Number of the rest frame, from 0; it is written first."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldFrame:
-    """world = rotation @ given + translation, after the unit."""
+    """Transform of the data to the world: world = rotation @ data [m] + translation."""
 
     rotation: Float[np.ndarray, "3 3"]
+    """Rotation matrix from the data to the world."""
     translation: Float[np.ndarray, " 3"]
-    """[m]."""
+    """Origin of the data in the world [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Some of the points, by number."""
+    """A choice of points by their row numbers."""
 
     rows: tuple[int, ...] = ()
+    """Row numbers, where no file is given."""
     file: str | None = None
-    """Numbers separated by blanks or commas."""
+    """Text file of row numbers, separated by blanks or commas."""
     first: int = 0
-    """The number that means the first row."""
+    """Number of the first row."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraspPath:
-    """A straight pull by an instrument that nobody measured."""
+    """A straight pull by an instrument whose position was not measured."""
 
     start: Float[np.ndarray, " 3"]
-    """Tip at the rest frame, world [m]."""
+    """Position of the tip at the rest frame, in the world [m]."""
     direction: Float[np.ndarray, " 3"]
-    """Of unit length."""
+    """Unit vector of the pull in the world."""
     step: float
-    """Advance from frame to frame [m]."""
+    """Displacement from frame to frame [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportedTool:
-    """An instrument that reported where it was, at times of its own."""
+    """An instrument that reported its position, at times of its own."""
 
     tool: str
-    """Array of the .npz, shape (reports, 3), in the points' unit and frame."""
+    """Name of the positions in the .npz, shape (reports, 3), in the unit and frame of the points."""
     times: str
-    """Array of the .npz, shape (reports,), rising [s]."""
-    turns: str | None
-    """Array of the .npz, shape (reports, 4): quaternions, w first, in the points' frame; None where it never turns."""
+    """Name of the reports' times in the .npz, shape (reports,), increasing [s]."""
+    orientations: str | None
+    """Name of the quaternions wxyz in the .npz, shape (reports, 4), in the frame of the points; None where the
+    orientation is constant."""
     rows: Rows
-    """Points that it holds."""
+    """Points that the instrument holds."""
     after: float
-    """How long each run shows the sheet at rest before the jaws count as closed [s]."""
+    """Time from the start of each run at which the jaws close; the sheet is at rest before [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Extension:
-    """How far the sheet goes on beyond the measured points, along an axis; stations are world coordinates [m]."""
+    """Continuation of the sheet beyond the measured points, along an axis; stations are world coordinates [m]."""
 
     axis: Float[np.ndarray, " 3"]
-    """Of unit length, in the sheet."""
+    """Unit vector in the sheet."""
     begin: float
+    """Station at which the sheet begins [m]."""
     end: float
+    """Station at which the sheet ends [m]."""
     spacing: float
-    """[m]."""
+    """Spacing of the added vertices [m]."""
     held_beyond: float | None = None
-    """Vertices farther out than this station are in the grip."""
+    """Station beyond which the jaws hold the vertices [m]; None where no vertex is declared held."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredRecording:
-    """All that a recording.toml says."""
+    """Contents of a recording.toml."""
 
     name: str
+    """Name of the recording."""
     source: str
+    """Where the data come from; empty where not given."""
     unit: float
-    """Metres in one unit of the data."""
+    """Metres in one unit of the data files."""
     period: int | None
-    """Time from frame to frame [ns]; None where the points have times."""
+    """Time from frame to frame [ns]; None where the frames have times."""
     noise_sd: float
-    """Stated standard deviation of each coordinate [m]."""
+    """Standard deviation of each coordinate's noise [m]."""
     points: PointFiles
+    """The files of the tracked points."""
     frame: WorldFrame
+    """Transform of the data to the world."""
     faces: str | None
-    """Key of the .npz, or a text file; None for none."""
+    """Name of the triangles in the .npz, or a text file; None for no declared triangles."""
     first_vertex: int
-    """The number that means the first vertex in the faces."""
+    """Number of the first vertex in the triangles."""
     extension: Extension | None
+    """Continuation of the sheet; None for none."""
     grasp: Rows | GraspPath | ReportedTool
+    """What gives the position of the tool: grasped points, a straight path, or its own reports."""
     grasp_radius: float
-    """[m]."""
+    """Radius of the grip [m]."""
     attached: Rows | float | None
-    """Truth for scoring: rows, or the station beyond which all is attached; None where nothing is known."""
+    """Truth for scoring: rows, or the station beyond which all is attached; None where the truth is unknown."""
     truth_details: dict[str, object]
+    """Further entries for the truth file."""
     declaration: Declaration
+    """The user's prior knowledge of the tissue."""
 
 
 def read_recording_toml(path: Path) -> MeasuredRecording:
-    """Read a recording.toml.
+    """Read a recording.toml and return its contents.
 
     Raises:
-        RecordingError: missing, not TOML, an unknown or missing key, a value of the wrong kind.
+        RecordingError: the file is missing or no TOML, a key is unknown or missing, or a value is of the wrong kind.
     """
     try:
         text = path.read_text()
@@ -158,14 +178,14 @@ def _recording(top: StrictTable) -> MeasuredRecording:
         name=top.take("name", kinds.text),
         source=top.take("source", kinds.text, ""),
         unit=UNITS[unit],
-        period=round(top.take("period", kinds.positive) * 1e9) if points.times is None else None,
+        period=round(top.take("period", kinds.positive) * NS_PER_S) if points.times is None else None,
         noise_sd=top.take("noise_sd", kinds.positive),
         points=points,
         frame=_frame(top.table("frame", optional=True)),
         faces=None if faces == "none" else faces,
         first_vertex=mesh.take("first_vertex", kinds.count, 0),
         extension=_extension(extend) if extend.given else None,
-        grasp_radius=grasp.take("radius", kinds.positive, 2e-3),
+        grasp_radius=grasp.take("radius", kinds.positive, DEFAULT_GRASP_RADIUS),
         grasp=_grasp(grasp),
         attached=_attached(truth),
         truth_details=dict(truth.take("details", kinds.table, {})),
@@ -174,9 +194,11 @@ def _recording(top: StrictTable) -> MeasuredRecording:
     for table in (mesh, extend, grasp, truth, top):
         table.refuse_unknown()
     if isinstance(recording.attached, float) and recording.extension is None:
-        raise RecordingError(f"{truth.where} attached_beyond needs [mesh.extend], whose axis it is counted along.")
+        raise RecordingError(f"{truth.where} attached_beyond needs [mesh.extend], whose axis gives its direction.")
     if isinstance(recording.grasp, ReportedTool) and points.times is None:
-        raise RecordingError(f"{grasp.where} tool has times, so the points must have some: give [points] times.")
+        raise RecordingError(
+            f"{grasp.where} tool has times, so the frames need times on the same clock: give [points] times."
+        )
     return recording
 
 
@@ -205,7 +227,7 @@ def _points(table: StrictTable) -> PointFiles:
 
 def _frame(table: StrictTable) -> WorldFrame:
     rotation = np.array(table.take("rotation", kinds.matrix, np.eye(3).tolist()))
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_ROTATION_ERROR) or np.linalg.det(rotation) < 0:
         raise RecordingError(f"{table.where} rotation is not a rotation: {rotation.tolist()}.")
     translation = np.array(table.take("translation", kinds.vector, [0.0, 0.0, 0.0]))
     table.refuse_unknown()
@@ -230,8 +252,8 @@ def _grasp(table: StrictTable) -> Rows | GraspPath | ReportedTool:
         return ReportedTool(
             tool=table.take("tool", kinds.text),
             times=table.take("tool_times", kinds.text),
-            turns=table.take("tool_turns", kinds.text, None),
-            rows=_some_rows(table),
+            orientations=table.take("tool_turns", kinds.text, None),
+            rows=_required_rows(table),
             after=table.take("after", kinds.number, 0.0),
         )
     table.known |= {"tool", "tool_times", "tool_turns", "after"}
@@ -242,10 +264,10 @@ def _grasp(table: StrictTable) -> Rows | GraspPath | ReportedTool:
             step=table.take("step", kinds.number),
         )
     table.known |= {"start", "direction", "step"}
-    return _some_rows(table)
+    return _required_rows(table)
 
 
-def _some_rows(table: StrictTable) -> Rows:
+def _required_rows(table: StrictTable) -> Rows:
     rows = _rows(table, "rows")
     if rows is None:
         raise RecordingError(f"{table.where} needs rows or rows_file, or start, direction and step.")

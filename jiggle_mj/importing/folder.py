@@ -1,8 +1,8 @@
-"""A folder of measured, tracked points becomes a recording, as its recording.toml says.
+"""Import of a folder of measured, tracked points: its recording.toml tells how it becomes a recording.
 
-Where the tool is, is in `import_tool`. The jaws are closed from the rest frame on, or in each run after the frames that
-show the sheet at rest, so that the tip's motion counts from there. What is known of the attachments goes into the truth
-file alone. No images; does not smooth, fill or filter the points.
+`tool` gives the position of the tool. The jaws are closed from the rest frame on, or in each run after the frames that
+show the sheet at rest, so that the tip's motion counts from there. Known attachments go into the truth file alone.
+Reads no images; does not smooth, fill or filter the points.
 """
 
 import os
@@ -18,35 +18,41 @@ from ..mesh_checks import check_mesh
 from ..observation import DeclaredMesh, MeasuredPoints, Observation
 from ..recording.declaration import identity
 from ..recording.mcap_files import truth_path
-from ..recording.reader import RecordingWriter
+from ..recording.schemas import NS_PER_S
 from ..recording.truth import write_truth
+from ..recording.writer import RecordingWriter
 from ..sheet_triangulation import SheetPlane, extend, triangulate
 from ..truth import Truth
 from .declaration import Extension, MeasuredRecording, Rows, read_recording_toml
 from .point_files import read_faces, read_frames, read_npz, read_rows
 from .tool import Tool
 
-LONGEST_EDGE = 2.5
-"""Spacings that an edge may span where nobody declared triangles: a missing row of points is bridged, two are not."""
+MAX_EDGE_SPACINGS = 2.5
+"""Longest edge of a triangle that is not declared [spacings]: it bridges one missing row of points, but not two."""
+MIN_REST_POINTS = 3
+"""Finite points that a rest frame needs: three span a plane."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSummary:
-    """What an import wrote."""
+    """Files and figures of an import."""
 
     recording: Path
+    """The recording."""
     truth: Path | None
-    """None where recording.toml knows nothing of the attachments."""
+    """The truth file; None where recording.toml gives no attachments."""
     n_frames: int
+    """Number of frames of the recording."""
     n_points: int
+    """Number of points in each frame."""
     n_unseen: int
-    """Points not seen, over all frames."""
+    """Number of points not seen, summed over the frames."""
     n_vertices: int | None
-    """Of the declared mesh; None without one."""
+    """Number of vertices of the declared mesh; None without one."""
     n_held: int
-    """Points or vertices declared to be in the grip."""
+    """Number of points or vertices that are declared held."""
     n_attached: int | None
-    """Attached vertices of the truth."""
+    """Number of attached vertices in the truth; None without truth."""
     skipped: tuple[tuple[str, str], ...]
     """Name and reason of each frame that was left out."""
 
@@ -58,44 +64,44 @@ def import_folder(
     *,
     overwrite: bool = False,
 ) -> ImportSummary:
-    """Turn a folder of measured data into a recording, and a truth file where the toml knows of attachments.
+    """Convert a folder of measured data to a recording, and a truth file where the TOML gives attachments.
 
     Args:
-        folder: where the data files are.
-        recording_toml: what they are; None for `recording.toml` in the folder.
+        folder: folder of the data files.
+        recording_toml: their description; None for `recording.toml` in the folder.
         out: the recording to write; the truth goes beside it, as `truth_path` says.
-        overwrite: replace files that are there.
+        overwrite: replace existing files.
 
     Raises:
-        RecordingError: the toml or a data file is missing or malformed, or the two disagree.
-        MeshError: the declared triangles are no sheet.
+        RecordingError: the TOML or a data file is missing or malformed, or the two contradict each other.
+        MeshError: the declared triangles are not one sheet.
         OutputError: an output exists, or cannot be written.
     """
     folder, out = Path(folder), Path(out)
-    said = read_recording_toml(folder / "recording.toml" if recording_toml is None else Path(recording_toml))
-    frames, names, steps = _frames_in_world(folder, said)
+    given = read_recording_toml(folder / "recording.toml" if recording_toml is None else Path(recording_toml))
+    frames, names, steps = _frames_in_world(folder, given)
     rest = frames[0]
-    mesh = _declared_mesh(folder, said, rest)
-    clock = _clock(folder, said, len(frames))
-    tool = Tool.read(folder, said, rest, name=names[0], origin=clock.origin)
-    name = identity(said.name, frames)
-    truth = _truth(folder, said, rest, mesh, name)
-    beside = truth_path(out)
-    for path in (out, beside):
+    mesh = _declared_mesh(folder, given, rest)
+    clock = _clock(folder, given, len(frames))
+    tool = Tool.read(folder, given, rest, name=names[0], origin=clock.origin)
+    name = identity(given.name, frames)
+    truth = _truth(folder, given, rest, mesh, name)
+    truth_file = truth_path(out)
+    for path in (out, truth_file):
         if path.exists() and not overwrite:
-            raise OutputError(f"{path} exists; choose another path, or allow it to be replaced (--overwrite).")
+            raise OutputError(f"{path} exists; choose another path, or allow the file to be replaced (--overwrite).")
     skipped: list[tuple[str, str]] = []
-    n_frames, n_unseen, before = 0, 0, 0
+    n_frames, n_unseen, previous_time = 0, 0, 0
     with RecordingWriter(
         out,
         camera=None,
-        declaration=replace(said.declaration, mesh=mesh),
-        metadata={"name": said.name, "source": said.source, "identity": name},
+        declaration=replace(given.declaration, mesh=mesh),
+        metadata={"name": given.name, "source": given.source, "identity": name},
         overwrite=overwrite,
     ) as writer:
         for number, (positions, file) in enumerate(zip(frames, names, strict=True)):
             unseen = ~np.isfinite(positions).all(axis=1)
-            if unseen.all() or tool.unknown(positions):
+            if unseen.all() or tool.is_unknown(positions):
                 skipped.append((file, "no finite point" if unseen.all() else "no grasped point seen"))
                 continue
             time, run, began = clock.times[number], clock.runs[number], clock.began[number]
@@ -104,17 +110,17 @@ def import_folder(
                     index=n_frames,
                     time=time,
                     tool=tool.state(step=steps[number], time=time, run=run, began=began, positions=positions),
-                    reports=tool.reports.between(before, time) if tool.reports is not None else (),
-                    points=MeasuredPoints(positions=positions, track_id=np.arange(len(rest)), sd=said.noise_sd),
+                    reports=tool.reports.between(previous_time, time) if tool.reports is not None else (),
+                    points=MeasuredPoints(positions=positions, track_id=np.arange(len(rest)), sd=given.noise_sd),
                 )
             )
-            n_frames, n_unseen, before = n_frames + 1, n_unseen + int(unseen.sum()), time
+            n_frames, n_unseen, previous_time = n_frames + 1, n_unseen + int(unseen.sum()), time
     if truth is not None:
-        write_truth(beside, truth, overwrite=overwrite)
+        write_truth(truth_file, truth, overwrite=overwrite)
     n_held = int(mesh.held.sum()) if mesh is not None and mesh.held is not None else len(tool.held)
     return ImportSummary(
         recording=out,
-        truth=None if truth is None else beside,
+        truth=None if truth is None else truth_file,
         n_frames=n_frames,
         n_points=len(rest),
         n_unseen=n_unseen,
@@ -125,47 +131,47 @@ def import_folder(
     )
 
 
-def _frames_in_world(folder: Path, said: MeasuredRecording) -> tuple[Float[np.ndarray, "t n 3"], list[str], list[int]]:
-    """Frames in the world [m], the rest frame first and usable; their names; how many frames after rest they lie."""
-    frames, names = read_frames(folder, said.points)
-    if said.points.rest >= len(frames):
-        raise RecordingError(f"[points] rest is {said.points.rest}; there are {len(frames)} frames, counted from 0.")
-    order = [said.points.rest, *(number for number in range(len(frames)) if number != said.points.rest)]
-    frames = frames[order] * said.unit @ said.frame.rotation.T + said.frame.translation
+def _frames_in_world(folder: Path, given: MeasuredRecording) -> tuple[Float[np.ndarray, "t n 3"], list[str], list[int]]:
+    """Return the frames in the world [m], the rest frame first; their names; their number of frames after rest."""
+    frames, names = read_frames(folder, given.points)
+    if given.points.rest >= len(frames):
+        raise RecordingError(f"[points] rest is {given.points.rest}; there are {len(frames)} frames, counted from 0.")
+    order = [given.points.rest, *(number for number in range(len(frames)) if number != given.points.rest)]
+    frames = frames[order] * given.unit @ given.frame.rotation.T + given.frame.translation
     frames[~np.isfinite(frames).all(axis=2)] = np.nan
     names = [names[number] for number in order]
-    if np.isfinite(frames[0]).all(axis=1).sum() < 3:
+    if np.isfinite(frames[0]).all(axis=1).sum() < MIN_REST_POINTS:
         raise RecordingError(f"the rest frame {names[0]} has fewer than three finite points; choose another rest.")
-    return frames, names, [number - said.points.rest for number in order]
+    return frames, names, [number - given.points.rest for number in order]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Clock:
-    """Of each frame."""
+    """Times and runs of the frames."""
 
     times: list[int]
-    """[ns]."""
+    """Time of each frame [ns]."""
     runs: list[int]
-    """From 1."""
+    """Number of each frame's run, from 1."""
     began: list[int]
-    """When its run began [ns]."""
+    """Time at which each frame's run began [ns]."""
     origin: float
-    """Time of the first frame where the data have times [s]."""
+    """Time of the first frame on the clock of the data [s]; 0 where the data have no times."""
 
 
-def _clock(folder: Path, said: MeasuredRecording, count: int) -> _Clock:
-    points, seconds, numbers = said.points, np.arange(float(count)), np.zeros(count)
+def _clock(folder: Path, given: MeasuredRecording, count: int) -> _Clock:
+    points, seconds, numbers = given.points, np.arange(float(count)), np.zeros(count)
     if points.times is not None:
         seconds = read_npz(folder / points.files[0], points.times)
     if points.runs is not None:
         numbers = read_npz(folder / points.files[0], points.runs)
     if seconds.shape != (count,) or numbers.shape != (count,) or not (np.diff(seconds) > 0).all():
         raise RecordingError(
-            f"[points] times must rise and have one entry for each of the {count} frames, and so must runs; they have "
-            f"shapes {seconds.shape} and {numbers.shape}."
+            f"[points] times must increase and have one entry for each of the {count} frames, and so must runs; "
+            f"they have shapes {seconds.shape} and {numbers.shape}."
         )
-    scale = 1e9 if said.period is None else said.period
-    times = [round((one - seconds[0]) * scale) for one in seconds]
+    scale = float(NS_PER_S) if given.period is None else given.period
+    times = [round((each - seconds[0]) * scale) for each in seconds]
     first = np.append(True, np.diff(numbers) != 0)
     started = np.maximum.accumulate(np.where(first, np.arange(count), 0))
     return _Clock(
@@ -176,15 +182,15 @@ def _clock(folder: Path, said: MeasuredRecording, count: int) -> _Clock:
     )
 
 
-def _declared_mesh(folder: Path, said: MeasuredRecording, rest: Float[np.ndarray, "n 3"]) -> DeclaredMesh | None:
-    if said.faces is None and said.extension is None:
+def _declared_mesh(folder: Path, given: MeasuredRecording, rest: Float[np.ndarray, "n 3"]) -> DeclaredMesh | None:
+    if given.faces is None and given.extension is None:
         return None
     rows, faces = np.flatnonzero(np.isfinite(rest).all(axis=1)), None
-    if said.faces is not None:
-        npz = folder / said.points.files[0] if said.points.key is not None else None
-        rows, faces = _seen_faces(rest, read_faces(folder, said.faces, npz=npz, first_vertex=said.first_vertex))
-    if said.extension is not None:
-        return _extended(rest, rows, faces, said.extension)
+    if given.faces is not None:
+        npz = folder / given.points.files[0] if given.points.key is not None else None
+        rows, faces = _seen_faces(rest, read_faces(folder, given.faces, npz=npz, first_vertex=given.first_vertex))
+    if given.extension is not None:
+        return _extended(rest, rows, faces, given.extension)
     assert faces is not None
     check_mesh(rest[rows], faces)
     return DeclaredMesh(vertices=rest[rows], faces=faces, track_id=rows)
@@ -193,7 +199,7 @@ def _declared_mesh(folder: Path, said: MeasuredRecording, rest: Float[np.ndarray
 def _seen_faces(
     rest: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, "g 3"]]:
-    """The rows that carry triangles, and the triangles renumbered to them; those with an unseen corner are left out."""
+    """Return the rows with triangles, and the triangles renumbered to them; those with an unseen corner are dropped."""
     if faces.size == 0 or faces.min() < 0 or faces.max() >= len(rest):
         check_mesh(rest, faces)
     faces = faces[np.isfinite(rest[faces]).all(axis=(1, 2))]
@@ -207,7 +213,7 @@ def _extended(
     faces: Int[np.ndarray, "f 3"] | None,
     extension: Extension,
 ) -> DeclaredMesh:
-    """The measured points and their continuation, triangulated anew, turned as the measured triangles are."""
+    """Return the measured points and their continuation, triangulated anew in the orientation of the measured faces."""
     if faces is not None:
         check_mesh(rest[rows], faces)
     plane = SheetPlane.through(rest[rows], extension.axis)
@@ -216,7 +222,7 @@ def _extended(
     added = extend(flat, begin=begin, end=end, spacing=extension.spacing)
     vertices = np.concatenate([rest[rows], plane.raise_up(added)])
     spacing = max(extension.spacing, _spacing(flat))
-    new_faces = triangulate(np.concatenate([flat, added]), LONGEST_EDGE * spacing)
+    new_faces = triangulate(np.concatenate([flat, added]), MAX_EDGE_SPACINGS * spacing)
     if faces is not None and _upward(plane, rest[rows], faces) < 0:
         new_faces = new_faces[:, ::-1].copy()
     held = None
@@ -233,50 +239,50 @@ def _extended(
 
 
 def _truth(
-    folder: Path, said: MeasuredRecording, rest: Float[np.ndarray, "n 3"], mesh: DeclaredMesh | None, name: str
+    folder: Path, given: MeasuredRecording, rest: Float[np.ndarray, "n 3"], mesh: DeclaredMesh | None, name: str
 ) -> Truth | None:
-    """Presence of attachments only; nothing is known of true positions, so there are no frames."""
-    if said.attached is None:
+    """Return the presence of attachments; true positions are unknown, so the truth has no frames."""
+    if given.attached is None:
         return None
-    if isinstance(said.attached, Rows):
-        nothing = said.attached.file is None and not said.attached.rows
-        rows = () if nothing else read_rows(folder, said.attached, len(rest), "[truth]")
+    if isinstance(given.attached, Rows):
+        nothing = given.attached.file is None and not given.attached.rows
+        rows = () if nothing else read_rows(folder, given.attached, len(rest), "[truth]")
         known = np.isin(np.arange(len(rest)), rows)
         vertices, faces, attached = _truth_sheet(rest, known, mesh)
     else:
-        assert mesh is not None and said.extension is not None
-        plane = SheetPlane.through(mesh.vertices[mesh.track_id >= 0], said.extension.axis)
-        vertices, faces, attached = mesh.vertices, mesh.faces, plane.beyond(mesh.vertices, said.attached)
+        assert mesh is not None and given.extension is not None
+        plane = SheetPlane.through(mesh.vertices[mesh.track_id >= 0], given.extension.axis)
+        vertices, faces, attached = mesh.vertices, mesh.faces, plane.beyond(mesh.vertices, given.attached)
     return Truth(
         rest=vertices,
         faces=faces,
         attached=attached,
         frames=(),
-        scene=said.name,
+        scene=given.name,
         identity=name,
-        details=said.truth_details,
+        details=given.truth_details,
     )
 
 
 def _truth_sheet(
     rest: Float[np.ndarray, "n 3"], known: Bool[np.ndarray, " n"], mesh: DeclaredMesh | None
 ) -> tuple[Float[np.ndarray, "m 3"], Int[np.ndarray, "f 3"], Bool[np.ndarray, " m"]]:
-    """Vertices, triangles and attachments: of the declared mesh, or of the seen rows, triangulated in their plane."""
+    """Return vertices, triangles and attachments of the declared mesh, or of the seen rows, triangulated here."""
     if mesh is not None:
         return mesh.vertices, mesh.faces, np.where(mesh.track_id >= 0, known[mesh.track_id], False)
     rows = np.flatnonzero(np.isfinite(rest).all(axis=1))
     flat = SheetPlane.through(rest[rows]).flatten(rest[rows])
-    used, renumbered = np.unique(triangulate(flat, LONGEST_EDGE * _spacing(flat)), return_inverse=True)
+    used, renumbered = np.unique(triangulate(flat, MAX_EDGE_SPACINGS * _spacing(flat)), return_inverse=True)
     rows = rows[used]
     return rest[rows], renumbered.reshape(-1, 3), known[rows]
 
 
 def _spacing(flat: Float[np.ndarray, "m 2"]) -> float:
-    """Typical distance between neighbours [m]."""
+    """Return the median distance between nearest neighbours [m]."""
     return float(np.median(KDTree(flat).query(flat, k=2)[0][:, 1]))
 
 
 def _upward(plane: SheetPlane, vertices: Float[np.ndarray, "m 3"], faces: Int[np.ndarray, "f 3"]) -> float:
-    """Sum of the triangles' normals along the plane's upward axis [m^2]."""
+    """Return twice the triangles' signed area, positive where they face along the plane's upward axis [m^2]."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return float((np.cross(b - a, c - a) @ plane.axes[2]).sum())

@@ -1,7 +1,7 @@
 """Reading tracked points, rows and triangles from the text files and .npz archives of measured data.
 
 Text: numbers in columns, separated by blanks, commas or semicolons; lines that begin with # or % are comments, and one
-heading line is passed over. Row i is the same material point in every frame. No units here: see `importing`.
+heading line is skipped. Row i is the same material point in every frame. Applies no units: see `folder`.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ from .declaration import PointFiles, Rows
 
 
 def read_frames(folder: Path, points: PointFiles) -> tuple[Float[np.ndarray, "t n 3"], list[str]]:
-    """All frames in the order of time, in the data's own unit, and a name for each.
+    """Return all frames in the order of time, in the unit of the data, and a name for each.
 
     Raises:
         RecordingError: a file is missing or malformed, or the frames differ in their number of points.
@@ -37,10 +37,10 @@ def read_frames(folder: Path, points: PointFiles) -> tuple[Float[np.ndarray, "t 
 
 
 def read_faces(folder: Path, faces: str, *, npz: Path | None, first_vertex: int) -> Int[np.ndarray, "f 3"]:
-    """Triangles from a key of the points' own .npz, or from a text file.
+    """Return triangles from an array of the points' .npz, or from a text file, with vertices counted from 0.
 
     Raises:
-        RecordingError: missing or malformed.
+        RecordingError: the array or file is missing or malformed.
     """
     table = read_npz(npz, faces) if npz is not None else _columns(folder / faces, (0, 1, 2))
     if table.ndim != 2 or table.shape[1] != 3 or not np.array_equal(table, np.round(table)):
@@ -49,10 +49,10 @@ def read_faces(folder: Path, faces: str, *, npz: Path | None, first_vertex: int)
 
 
 def read_rows(folder: Path, rows: Rows, n_points: int, where: str) -> Int[np.ndarray, " r"]:
-    """Row numbers counted from 0.
+    """Return row numbers, counted from 0.
 
     Raises:
-        RecordingError: the file is missing, holds no numbers, or a number is no row.
+        RecordingError: the file is missing or holds no numbers, or a number is not that of a row.
     """
     numbers: list[int] = list(rows.rows)
     if rows.file is not None:
@@ -71,10 +71,10 @@ def read_rows(folder: Path, rows: Rows, n_points: int, where: str) -> Int[np.nda
 
 
 def read_npz(path: Path, key: str) -> np.ndarray:
-    """One array of an archive.
+    """Return one array of an archive.
 
     Raises:
-        RecordingError: no such file, no archive, no such key.
+        RecordingError: the file is missing or no archive, or has no such array.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -102,13 +102,13 @@ def _columns(path: Path, columns: tuple[int, ...]) -> Float[np.ndarray, "n c"]:
             continue
         if len(words) <= max(columns):
             raise RecordingError(
-                f"{path} line {number} has {len(words)} columns; columns {list(columns)} (from 0) are wanted."
+                f"{path} line {number} has {len(words)} columns; columns {list(columns)} (from 0) are needed."
             )
         try:
             table.append([float(words[column]) for column in columns])
         except ValueError as failure:
             if table or number > 1:
-                raise RecordingError(f"{path} line {number} is not numbers ({failure}).") from failure
+                raise RecordingError(f"{path} line {number} holds text that is not a number ({failure}).") from failure
     if not table:
         raise RecordingError(f"{path} holds no rows of numbers.")
     return np.array(table)

@@ -1,1 +1,1 @@
-"""Recordings as MCAP files: reading, writing, their messages, estimates and the truth beside them."""
+"""Recordings as MCAP files: reader, writer, message schemas, and the files of estimate and truth."""

@@ -1,7 +1,8 @@
-"""The contents of a recording's file: its topics, everything small read at once, and where the rest is.
+"""The contents of a recording's file: its topics, its small messages, and the place of its images and points.
 
-Takes the topics it knows, counts the others, refuses truth and what is no recording. Images and points are handed out
-later, still encoded; grouping them into moments is `recording_moments`, turning them into observations `recording`.
+Reads the topics of `SCHEMAS` and the JSON ones, counts the messages of others, refuses truth and files that are no
+recordings. Images and points are handed out later, still encoded: `pairing` groups them into frames, `reader` turns
+them into observations.
 """
 
 from collections import Counter
@@ -21,7 +22,7 @@ from mcap.records import Channel, Message, Metadata, Schema
 from ..actions import Cut, Suture
 from ..errors import RecordingError
 from ..observation import Declaration
-from .declaration import DECLARATION, MESH, METADATA, parse_declaration, with_mesh
+from .declaration import DECLARATION, DECLARED_MESH, METADATA, parse_declaration, with_mesh
 from .events import parse_event
 from .frames import FrameTree
 from .mcap_files import iterate_records
@@ -31,7 +32,8 @@ from .schemas import parse_grasp, stamp_of
 LEFT, RIGHT = "/camera/left/image_raw", "/camera/right/image_raw"
 LEFT_INFO, RIGHT_INFO = "/camera/left/camera_info", "/camera/right/camera_info"
 TF, POSE, GRASP, POINTS, EVENT = "/tf", "/tool/pose", "/tool/grasp", "/tissue/points", "/event/topology"
-AS_JSON = (GRASP, EVENT)
+JSON_TOPICS = (GRASP, EVENT)
+"""Topics whose messages are JSON."""
 SCHEMAS: dict[str, tuple[Any, ...]] = {
     LEFT: (CompressedImage, RawImage),
     RIGHT: (CompressedImage, RawImage),
@@ -41,11 +43,11 @@ SCHEMAS: dict[str, tuple[Any, ...]] = {
     POSE: (PoseInFrame,),
     POINTS: (PointCloud,),
 }
-"""The topics that are read as protobuf, and the classes allowed on each."""
+"""Topics that are read as protobuf, and the message classes allowed on each."""
 
 
 class RecordingContents:
-    """One file, read once from end to end when this is made.
+    """The messages of one file, which the constructor reads from end to end.
 
     Raises:
         RecordingError: missing, not an MCAP, truncated, damaged, foreign, holding truth, uncalibrated.
@@ -61,36 +63,36 @@ class RecordingContents:
         self.grasps: dict[int, dict[str, Any]] = {}
         self.stamped: dict[str, list[Stamped]] = {topic: [] for topic in (LEFT, RIGHT, POINTS, POSE, GRASP)}
         self.events: list[tuple[int, Cut | Suture]] = []
-        """Stamp [ns] of each, in order."""
+        """Cuts and sutures, each with its stamp [ns], by stamp."""
         self._classes: dict[int, Any] = {}
         ignored: Counter[str] = Counter()
         for ordinal, topic, message in self._messages():
             if topic == EVENT:
                 self.events.append((message.log_time, parse_event(message.data)))
             elif topic == GRASP or topic in SCHEMAS:
-                self._take_in(ordinal, topic, message)
+                self._store(ordinal, topic, message)
             else:
                 ignored[topic] += 1
-        self.events.sort(key=lambda stamped: stamped[0])
+        self.events.sort(key=lambda event: event[0])
         self.ignored = dict(sorted(ignored.items()))
         self._refuse_incomplete()
 
     @property
     def has_images(self) -> bool:
-        """Whether any image was recorded."""
+        """Return whether the file holds an image."""
         return bool(self.stamped[LEFT] or self.stamped[RIGHT])
 
     def encoded(self, wanted: dict[int, str]) -> Iterator[tuple[int, Any]]:
-        """Messages by their ordinals, parsed and not yet decoded, in file order.
+        """Yield messages with their ordinals in file order; images are parsed and not yet decoded.
 
         Args:
-            wanted: topic of each message by ordinal.
+            wanted: topic of each wanted message by its ordinal.
         """
         for ordinal, topic, message in self._messages():
             if ordinal in wanted:
                 yield ordinal, self._parse(topic, message)
 
-    def _take_in(self, ordinal: int, topic: str, message: Message) -> None:
+    def _store(self, ordinal: int, topic: str, message: Message) -> None:
         stamp = message.log_time
         if topic == GRASP:
             self.grasps[ordinal] = parse_grasp(message.data)
@@ -109,7 +111,7 @@ class RecordingContents:
         self.stamped[topic].append(Stamped(stamp=stamp, ordinal=ordinal))
 
     def _messages(self) -> Iterator[tuple[int, str, Message]]:
-        """Messages with their ordinal and topic; metadata and declaration are kept on the way."""
+        """Yield each message with its ordinal and topic; store metadata and declaration as they come."""
         schemas: dict[int, Schema] = {}
         topics: dict[int, str] = {}
         ordinal = 0
@@ -128,28 +130,30 @@ class RecordingContents:
                     self.metadata = dict(record.metadata)
                 elif record.name == DECLARATION:
                     self.declaration = parse_declaration(record.metadata.get("json", ""))
-            elif record.name == MESH:
+            elif record.name == DECLARED_MESH:
                 self.declaration = with_mesh(self.declaration, record, self.path)
 
     def _parse(self, topic: str, message: Message) -> Any:
-        kind = self._classes[message.channel_id]
+        message_class = self._classes[message.channel_id]
         try:
-            return kind.FromString(message.data)
+            return message_class.FromString(message.data)
         except DecodeError as failure:
-            raise RecordingError(f"{self.path}: a message on {topic} is not a {kind.__name__}: {failure}.") from failure
+            raise RecordingError(
+                f"{self.path}: a message on {topic} is not a {message_class.__name__}: {failure}."
+            ) from failure
 
     def _choose_class(self, channel: Channel, schema: Schema | None) -> None:
         name, encoding = (schema.name if schema else "without a schema"), channel.message_encoding
-        if channel.topic in AS_JSON and encoding != "json":
+        if channel.topic in JSON_TOPICS and encoding != "json":
             raise RecordingError(f"{self.path}: {channel.topic} is {name} ({encoding}); it must be JSON.")
         if channel.topic not in SCHEMAS:
             return
-        kinds = {kind.DESCRIPTOR.full_name: kind for kind in SCHEMAS[channel.topic]}
-        if encoding != "protobuf" or name not in kinds:
+        allowed = {each.DESCRIPTOR.full_name: each for each in SCHEMAS[channel.topic]}
+        if encoding != "protobuf" or name not in allowed:
             raise RecordingError(
-                f"{self.path}: {channel.topic} is {name} ({encoding}); it must be {' or '.join(kinds)} (protobuf)."
+                f"{self.path}: {channel.topic} is {name} ({encoding}); it must be {' or '.join(allowed)} (protobuf)."
             )
-        self._classes[channel.id] = kinds[name]
+        self._classes[channel.id] = allowed[name]
 
     def _refuse_truth(self, topic: str) -> None:
         if topic.startswith("/truth/"):
@@ -158,15 +162,15 @@ class RecordingContents:
             raise RecordingError(f"{name} holds /truth topics; the estimator reads observations only{advice}.")
 
     def _refuse_incomplete(self) -> None:
-        """Refuse a file without a tool, with neither a stereo pair nor points, or without calibration."""
-        found = {topic for topic, messages in self.stamped.items() if messages} | set(self.calibrations)
+        """Refuse a file that lacks the tool, both a stereo pair and points, or the calibration of its images."""
+        present = {topic for topic, messages in self.stamped.items() if messages} | set(self.calibrations)
         sensors = f"{POINTS} or the pair {LEFT}, {RIGHT}"
-        if not found:
+        if not present:
             raise RecordingError(
                 f"{self.path} is foreign: it needs {POSE}, {GRASP} and {sensors}; "
                 f"its topics are: {', '.join(self.ignored) or 'none'}."
             )
-        missing = [topic for topic in (POSE, GRASP) if topic not in found]
+        missing = [topic for topic in (POSE, GRASP) if topic not in present]
         if bool(self.stamped[LEFT]) != bool(self.stamped[RIGHT]):
             missing.append(LEFT if self.stamped[RIGHT] else RIGHT)
         if not (self.has_images or self.stamped[POINTS]):
@@ -174,7 +178,7 @@ class RecordingContents:
         if missing:
             raise RecordingError(
                 f"{self.path} lacks {' and '.join(missing)}; its topics are: "
-                f"{', '.join(sorted(found | set(self.ignored)))}."
+                f"{', '.join(sorted(present | set(self.ignored)))}."
             )
         uncalibrated = [topic for topic in (LEFT_INFO, RIGHT_INFO) if topic not in self.calibrations]
         if self.has_images and uncalibrated:

@@ -1,6 +1,6 @@
-"""What a recording says of itself and of the tissue: the metadata record and the user's declaration.
+"""The metadata record of a file, and the user's declaration of the tissue.
 
-A declared mesh travels as an npz attachment, all else as JSON in metadata records.
+A declared mesh is an npz attachment, everything else JSON in metadata records.
 """
 
 import hashlib
@@ -17,33 +17,38 @@ from ..errors import RecordingError
 from ..observation import Declaration, DeclaredMesh
 from .mcap_files import McapOutput, read_arrays
 
-METADATA, DECLARATION, MESH = "jiggle_mj", "jiggle_mj.declaration", "declared_mesh.npz"
+METADATA, DECLARATION, DECLARED_MESH = "jiggle_mj", "jiggle_mj.declaration", "declared_mesh.npz"
+"""Names of two metadata records and of an attachment."""
 FORMAT = "1"
+"""Version of the layout that docs/RECORDINGS.md describes."""
 VERSION = "version.jiggle-mj"
+"""Key of this package's version in the metadata."""
+IDENTITY_DIGITS = 16
+"""Hexadecimal digits of an identity: 64 bits, so that no two of a million recordings are likely to share one."""
 
 
 def file_metadata() -> dict[str, str]:
-    """What every file says of its making: the format, units and versions; no date."""
+    """Return what every file states of its making: format, units and versions; no date."""
     packages = ("jiggle-mj", "numpy", "mcap", "foxglove-schemas-protobuf", "opencv-python-headless")
     return {"format": FORMAT, "units": "SI (m, N, s), time in ns"} | {f"version.{p}": version(p) for p in packages}
 
 
 def made_by() -> dict[str, str]:
-    """The version of this package, as `file_metadata` has it."""
+    """Return the entry of `file_metadata` that states the version of this package."""
     return {VERSION: file_metadata()[VERSION]}
 
 
 def is_current(written: Mapping[str, object]) -> bool:
-    """Whether this version wrote something that holds what `made_by` says."""
+    """Return whether this version of the package wrote something that holds the entry of `made_by`."""
     return written.get(VERSION) == made_by()[VERSION]
 
 
 def identity(*parts: object) -> str:
-    """A name for a recording, the same for the same contents: 16 hexadecimal digits over arrays and JSON values."""
+    """Return the identity of a recording: `IDENTITY_DIGITS` digits of the SHA-256 of arrays and JSON values."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part.tobytes() if isinstance(part, np.ndarray) else json.dumps(part, sort_keys=True).encode())
-    return digest.hexdigest()[:16]
+    return digest.hexdigest()[:IDENTITY_DIGITS]
 
 
 def write_declaration(output: McapOutput, declaration: Declaration) -> None:
@@ -52,11 +57,11 @@ def write_declaration(output: McapOutput, declaration: Declaration) -> None:
     output.metadata(DECLARATION, {"json": json.dumps(values, sort_keys=True, allow_nan=False)})
     if declaration.mesh is not None:
         arrays = {f.name: getattr(declaration.mesh, f.name) for f in fields(declaration.mesh)}
-        output.arrays(MESH, {name: np.asarray(array) for name, array in arrays.items() if array is not None})
+        output.arrays(DECLARED_MESH, {name: np.asarray(array) for name, array in arrays.items() if array is not None})
 
 
 def parse_declaration(text: str) -> Declaration:
-    """The declaration in a metadata record, without its mesh.
+    """Return the declaration in a metadata record, without its mesh.
 
     Raises:
         RecordingError: not JSON, an unknown field, or a value that `Declaration` refuses.
@@ -71,15 +76,15 @@ def parse_declaration(text: str) -> Declaration:
 
 
 def with_mesh(declaration: Declaration, attachment: Attachment, path: Path) -> Declaration:
-    """The declaration with the mesh of an attachment.
+    """Return the declaration with the mesh of an attachment.
 
     Raises:
-        RecordingError: the attachment lacks an array, or holds one that is not known.
+        RecordingError: the attachment lacks an array, or holds an unknown one.
     """
     arrays = read_arrays(attachment, path)
     try:
         return replace(declaration, mesh=DeclaredMesh(**arrays))
     except TypeError as failure:
         raise RecordingError(
-            f"{path}: {MESH} must hold vertices, faces, track_id and perhaps held; it has {', '.join(arrays)}."
+            f"{path}: {DECLARED_MESH} must hold vertices, faces, track_id and perhaps held; it has {', '.join(arrays)}."
         ) from failure

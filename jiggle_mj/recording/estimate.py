@@ -1,6 +1,6 @@
-"""The estimator's answer as a file: the sheet, one estimate a frame, and the belief and detection at the end.
+"""The estimate as a file: the sheet, one estimate per frame, and the final belief and detection.
 
-Foxglove and Rerun draw `/estimate/points`, Foxglove `/estimate/mesh` besides. Wall times are not written: the same
+Foxglove and Rerun draw `/estimate/points`; Foxglove also draws `/estimate/mesh`. Wall times are not written: the same
 estimate gives the same bytes.
 """
 
@@ -27,9 +27,12 @@ from .declaration import METADATA, file_metadata
 from .mcap_files import McapOutput, iterate_records, read_arrays
 from .schemas import WORLD, fill_pose, parse_points, point_cloud, timestamp
 
-POINTS, MESH, DIAGNOSTICS = "/estimate/points", "/estimate/mesh", "/diagnostics/filter"
+ESTIMATE_POINTS, ESTIMATE_MESH, DIAGNOSTICS = "/estimate/points", "/estimate/mesh", "/diagnostics/filter"
+"""Topics."""
 SHEET, BELIEF, DETECTION = "sheet.npz", "belief.npz", "detection.npz"
-RESULT = "jiggle_mj.result"
+"""Attachments."""
+RESULT_RECORD = "jiggle_mj.result"
+"""Metadata record with the detection's rule and the skipped frames."""
 DIAGNOSTICS_SCHEMA: dict[str, object] = {
     "title": "jiggle_mj.FilterDiagnostics",
     "type": "object",
@@ -47,19 +50,19 @@ Stored = TypeVar("Stored")
 COLOURS = np.array(
     [[0.267, 0.005, 0.329], [0.229, 0.322, 0.546], [0.128, 0.567, 0.551], [0.369, 0.789, 0.383], [0.993, 0.906, 0.144]]
 )
-"""Free to attached: five colours of matplotlib's viridis (CC0), which keeps its order in grey."""
+"""Colours from free to attached, RGB in 0..1: five of matplotlib's viridis (CC0), whose brightness rises."""
 HALF_COLOUR = 1.0
-"""Stiffness that is drawn in the middle of the colours [N/m]: b is shown as b / (b + this), so that welds fit."""
+"""Stiffness of the middle colour [N/m]: b is drawn as b / (b + this), which is 1 for a weld."""
 
 
 class EstimateWriter:
-    """Writes estimates as they come; what is written survives a crash.
+    """Write estimates to a file as they come; what is written survives a crash.
 
     Args:
         path: the file to write.
-        sheet: the particles, fixed from here on.
-        metadata: the caller's own, such as the recording's name and the settings.
-        overwrite: replace a file that is there.
+        sheet: the particles, the same for all frames.
+        metadata: entries of the caller, such as the recording's name and the settings.
+        overwrite: replace an existing file.
 
     Raises:
         OutputError: the path exists, or cannot be written.
@@ -93,8 +96,8 @@ class EstimateWriter:
             columns |= {f"{prefix}_{axis}": np.asarray(positions, float)[:, i] for i, axis in enumerate("xyz")}
         columns |= {"b_mean": np.asarray(estimate.mean, float), "b_sd": np.asarray(estimate.sd, float)}
         columns["p_attached"] = np.asarray(estimate.probability, float)
-        output.message(POINTS, time, point_cloud(time, columns | {"held": np.asarray(estimate.held, bool)}))
-        output.message(MESH, time, _mesh_message(estimate, self._sheet))
+        output.message(ESTIMATE_POINTS, time, point_cloud(time, columns | {"held": np.asarray(estimate.held, bool)}))
+        output.message(ESTIMATE_MESH, time, _mesh_message(estimate, self._sheet))
         numbers = {name: _json_number(getattr(estimate, name)) for name in ("entropy", "nis", "boundary_energy")}
         output.json(
             DIAGNOSTICS,
@@ -105,50 +108,53 @@ class EstimateWriter:
         output.flush()
 
     def finish(self, belief: Belief, detection: Detection, *, skipped: Sequence[tuple[int, str]] = ()) -> None:
-        """Write how it ended, and close the file.
+        """Write the final belief and detection, and close the file.
 
         Args:
-            belief: over all frames.
-            detection: from that belief.
+            belief: the belief after the last frame.
+            detection: the particles called attached by that belief.
             skipped: index and reason of each observation that was not used.
         """
         output = self._output
-        for name, said, left_out in ((BELIEF, belief, ()), (DETECTION, detection, ("rule",))):
-            stated = {field.name: getattr(said, field.name) for field in fields(said) if field.name not in left_out}
-            output.arrays(name, {key: np.asarray(value) for key, value in stated.items() if value is not None})
-        listed = json.dumps([[int(index), why] for index, why in skipped])
-        output.metadata(RESULT, {"rule": detection.rule, "skipped": listed})
+        for name, result, excluded in ((BELIEF, belief, ()), (DETECTION, detection, ("rule",))):
+            values = {field.name: getattr(result, field.name) for field in fields(result) if field.name not in excluded}
+            output.arrays(name, {key: np.asarray(value) for key, value in values.items() if value is not None})
+        reasons = json.dumps([[int(index), why] for index, why in skipped])
+        output.metadata(RESULT_RECORD, {"rule": detection.rule, "skipped": reasons})
         self.close()
 
     def close(self) -> None:
-        """Write the index and close the file, finished or not."""
+        """Write the index and close the file; without `finish` the file has no belief."""
         self._output.close()
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateRecording:
-    """An estimate read back."""
+    """An estimate read from a file."""
 
     sheet: Sheet
+    """Particles of the estimator."""
     estimates: tuple[Estimate, ...]
-    """Their wall times are 0: they are not in the file."""
+    """The estimate after each frame; wall times are 0, as the file has none."""
     belief: Belief | None
-    """None where the run did not finish; so for `detection`."""
+    """Final belief; None where the run did not finish."""
     detection: Detection | None
+    """Final detection; None where the run did not finish."""
     skipped: tuple[tuple[int, str], ...]
     """Index and reason of each observation that was not used."""
     metadata: dict[str, str]
+    """Versions, units and the settings of the estimator."""
 
 
 def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False) -> EstimateRecording:
-    """Read an estimate.
+    """Read an estimate and return it.
 
     Raises:
-        RecordingError: missing, not an MCAP, truncated, damaged, not an estimate, or one of another version.
+        RecordingError: missing, not an MCAP, truncated, damaged, not an estimate, or written by another version.
     """
     path = Path(path)
     topics: dict[int, str] = {}
-    messages: dict[str, list[Message]] = {POINTS: [], DIAGNOSTICS: []}
+    messages: dict[str, list[Message]] = {ESTIMATE_POINTS: [], DIAGNOSTICS: []}
     arrays: dict[str, dict[str, np.ndarray]] = {}
     metadata: dict[str, dict[str, str]] = {}
     for record in iterate_records(path, allow_truncated=allow_truncated):
@@ -161,12 +167,12 @@ def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False
         elif isinstance(record, Metadata):
             metadata[record.name] = dict(record.metadata)
     if SHEET not in arrays:
-        found = ", ".join(sorted(set(topics.values()))) or "none"
-        raise RecordingError(f"{path} is not an estimate: it lacks {SHEET}; its topics are: {found}.")
-    result = metadata.get(RESULT)
+        names = ", ".join(sorted(set(topics.values()))) or "none"
+        raise RecordingError(f"{path} is not an estimate: it lacks {SHEET}; its topics are: {names}.")
+    result = metadata.get(RESULT_RECORD)
     return EstimateRecording(
         sheet=_stored(Sheet, arrays[SHEET], path),
-        estimates=tuple(_parse(*pair) for pair in zip(messages[POINTS], messages[DIAGNOSTICS], strict=False)),
+        estimates=tuple(_parse(*pair) for pair in zip(messages[ESTIMATE_POINTS], messages[DIAGNOSTICS], strict=False)),
         belief=_stored(Belief, arrays[BELIEF], path) if result else None,
         detection=_stored(Detection, arrays[DETECTION] | {"rule": result["rule"]}, path) if result else None,
         skipped=tuple((index, why) for index, why in json.loads(result["skipped"])) if result else (),
@@ -175,13 +181,14 @@ def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False
 
 
 def _parse(points: Message, diagnostics: Message) -> Estimate:
-    columns = parse_points(PointCloud.FromString(points.data), POINTS)
-    said = json.loads(diagnostics.data)
+    columns = parse_points(PointCloud.FromString(points.data), ESTIMATE_POINTS)
+    diagnosed = json.loads(diagnostics.data)
     numbers = {
-        name: math.nan if said[name] is None else float(said[name]) for name in ("entropy", "nis", "boundary_energy")
+        name: math.nan if diagnosed[name] is None else float(diagnosed[name])
+        for name in ("entropy", "nis", "boundary_energy")
     }
     return Estimate(
-        index=said["index"],
+        index=diagnosed["index"],
         time=points.log_time,
         positions=np.column_stack([columns[axis] for axis in "xyz"]),
         observed=np.column_stack([columns[f"observed_{axis}"] for axis in "xyz"]),
@@ -191,18 +198,18 @@ def _parse(points: Message, diagnostics: Message) -> Estimate:
         held=columns["held"].astype(bool),
         update_s=0.0,
         perception_s=0.0,
-        converged=said.get("converged", True),
+        converged=diagnosed.get("converged", True),
         **numbers,
     )
 
 
 def _stored(kind: type[Stored], values: dict[str, Any], path: Path) -> Stored:
-    """A dataclass from what was stored of it; arrays of no dimension are the numbers that they were."""
+    """Return a dataclass from its stored arrays; arrays without a dimension become numbers."""
     known = fields(cast(Any, kind))
-    lacking = [field.name for field in known if field.default is MISSING and field.name not in values]
-    if lacking:
+    missing = [field.name for field in known if field.default is MISSING and field.name not in values]
+    if missing:
         raise RecordingError(
-            f"{path} was written by another version of jiggle-mj: its {kind.__name__} lacks {', '.join(lacking)}. "
+            f"{path} was written by another version of jiggle-mj: its {kind.__name__} lacks {', '.join(missing)}. "
             "Estimate again from the recording."
         )
     numbers = {name: value.item() if getattr(value, "ndim", 1) == 0 else value for name, value in values.items()}
@@ -210,7 +217,7 @@ def _stored(kind: type[Stored], values: dict[str, Any], path: Path) -> Stored:
 
 
 def _json_number(value: float) -> float | None:
-    """JSON knows no NaN: null stands for what is not finite."""
+    """Return the number, or None where it is not finite: JSON has no NaN."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -227,7 +234,7 @@ def _mesh_message(estimate: Estimate, sheet: Sheet) -> SceneUpdate:
 
 
 def stiffness_colours(mean: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Colour of each attachment stiffness [N/m]: red, green, blue in 0..1."""
+    """Return the colour of each attachment stiffness [N/m] as red, green, blue in 0..1."""
     bounded = np.clip(1 - HALF_COLOUR / (np.maximum(mean, 0) + HALF_COLOUR), 0, 1)
     stops = np.linspace(0, 1, len(COLOURS))
     return np.column_stack([np.interp(bounded, stops, channel) for channel in COLOURS.T])

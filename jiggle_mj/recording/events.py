@@ -1,4 +1,4 @@
-"""What was cut and sewn, as messages: the intended change, not whether it succeeded."""
+"""Cuts and sutures as messages: the intended change, not whether it succeeded."""
 
 import json
 
@@ -17,34 +17,37 @@ EVENT_SCHEMA: dict[str, object] = {
             "description": "corners [x, y] of the region's middle line on the resting sheet [m]",
         },
         "width": {"type": "number", "description": "of the region, across the path and around its ends [m]"},
-        "stiffness": {"type": "number", "description": "of each sewn particle's attachment [N/m]; sutures only"},
+        "stiffness": {
+            "type": "number",
+            "description": "of each sewn particle's attachment [N/m]; sutures only",
+        },
     },
     "required": ["kind", "path", "width"],
 }
 
 
 def event_json(event: Cut | Suture) -> dict[str, object]:
-    """The message of an event, after `EVENT_SCHEMA`."""
-    said: dict[str, object] = {"path": np.asarray(event.path, float).tolist(), "width": float(event.width)}
+    """Return the message of an event, which follows `EVENT_SCHEMA`."""
+    region: dict[str, object] = {"path": np.asarray(event.path, float).tolist(), "width": float(event.width)}
     if isinstance(event, Suture):
-        return said | {"kind": "suture", "stiffness": float(event.stiffness)}
-    return said | {"kind": "cut"}
+        return region | {"kind": "suture", "stiffness": float(event.stiffness)}
+    return region | {"kind": "cut"}
 
 
 def parse_event(data: bytes) -> Cut | Suture:
-    """The event of a message.
+    """Return the event of a message.
 
     Raises:
         RecordingError: not JSON, or a field missing or of the wrong kind.
     """
     try:
-        said = json.loads(data)
-        path, width = np.array(said["path"], dtype=float), float(said["width"])
-        if path.ndim != 2 or path.shape[1] != 2 or said["kind"] not in ("cut", "suture"):
+        value = json.loads(data)
+        path, width = np.array(value["path"], dtype=float), float(value["width"])
+        if path.ndim != 2 or path.shape[1] != 2 or value["kind"] not in ("cut", "suture"):
             raise ValueError("path must be a list of [x, y], kind 'cut' or 'suture'")
-        if said["kind"] == "cut":
+        if value["kind"] == "cut":
             return Cut(path=path, width=width)
-        return Suture(path=path, width=width, stiffness=float(said["stiffness"]))
+        return Suture(path=path, width=width, stiffness=float(value["stiffness"]))
     except (KeyError, TypeError, ValueError) as failure:
         raise RecordingError(
             f"/event/topology must be JSON {{kind, path, width, stiffness}}; got {data[:80]!r} ({failure!r})."

@@ -1,7 +1,7 @@
-"""Coordinate frames of a recording: the transforms that lead from any named frame to the world.
+"""Coordinate frames of a recording: the transform from any named frame to the world.
 
-Frames stand still: a recording gives each one pose, and a frame that moves is refused where it is asked for.
-Optical frames belong to the raw images; rectification turns them by the calibration's R, as in ROS's image_proc.
+Frames stand still: a recording gives each one pose, and the transform of a frame that moves is refused.
+Optical frames belong to the raw images; rectification rotates them by the calibration's R, as in ROS's image_proc.
 """
 
 import numpy as np
@@ -12,22 +12,22 @@ from ..camera import StereoCamera
 from ..errors import RecordingError
 from .schemas import CAMERA_FRAMES, WORLD, frame_transform, parse_transform
 
-STANDS_STILL = 1e-6
-"""Largest change of a transform's entries [m, or of a cosine] that counts as none: rounding of a robot's messages."""
+MAX_STATIC_CHANGE = 1e-6
+"""Largest change of a static transform's entries [m, or 1 for a cosine]: the rounding of a robot's messages."""
 
 
 class FrameTree:
-    """Frames by name, each with its parent and its pose there."""
+    """Coordinate frames by name, each with its parent and its pose in the parent."""
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Float[np.ndarray, "4 4"]]] = {}
         self._moving: set[str] = set()
 
     def add(self, message: FrameTransforms) -> None:
-        """Take in the transforms of one message.
+        """Add the transforms of one message.
 
         Raises:
-            RecordingError: a transform holds NaN or no rotation.
+            RecordingError: a transform holds NaN, or its quaternion is not of unit length.
         """
         for transform in message.transforms:
             child, parent = transform.child_frame_id, transform.parent_frame_id
@@ -36,11 +36,11 @@ class FrameTree:
             except RecordingError as failure:
                 raise RecordingError(f"/tf from {parent} to {child}: {failure}.") from failure
             known_parent, known = self._parents.setdefault(child, (parent, T))
-            if known_parent != parent or not np.allclose(known, T, rtol=0, atol=STANDS_STILL):
+            if known_parent != parent or not np.allclose(known, T, rtol=0, atol=MAX_STATIC_CHANGE):
                 self._moving.add(child)
 
     def T_world(self, frame: str, where: str) -> Float[np.ndarray, "4 4"]:
-        """Pose of a frame in the world; an empty name is the world.
+        """Return the pose of a frame in the world; an empty name is the world.
 
         Raises:
             RecordingError: the frame is not connected to the world, or moves.
@@ -60,21 +60,24 @@ class FrameTree:
 
 
 def transform_of_rotation(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
-    """A rectifying rotation, raw to rectified optical frame, as a transform."""
+    """Return a rotation as a transform without translation."""
     T = np.eye(4)
     T[:3, :3] = R
     return T
 
 
 def camera_transforms(camera: StereoCamera) -> FrameTransforms:
-    """The poses of both optical frames: the left one in the world, the right one a baseline along the rectified x."""
+    """Return the poses of both raw optical frames: the left one in the world, the right one in the left one.
+
+    The baseline lies along the rectified x.
+    """
     left, right = CAMERA_FRAMES["left"], CAMERA_FRAMES["right"]
     T_rectified_raw = {side: transform_of_rotation(getattr(camera, side).R) for side in ("left", "right")}
-    aside = np.eye(4)
-    aside[0, 3] = camera.baseline
+    T_left_right = np.eye(4)
+    T_left_right[0, 3] = camera.baseline
     return FrameTransforms(
         transforms=[
             frame_transform(WORLD, left, camera.T_world_camera @ T_rectified_raw["left"]),
-            frame_transform(left, right, T_rectified_raw["left"].T @ aside @ T_rectified_raw["right"]),
+            frame_transform(left, right, T_rectified_raw["left"].T @ T_left_right @ T_rectified_raw["right"]),
         ]
     )

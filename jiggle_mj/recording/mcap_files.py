@@ -1,8 +1,8 @@
 """MCAP files whose bytes depend on their content alone, and reading them record by record.
 
-A file is flushed by its writer after each moment, so that a crash loses at most the moment in progress; the reader
-finds where the whole records end. Format: https://mcap.dev/spec. Knows nothing of topics: see `recording_schemas`.
-Reads front to back without the index: a recording is always wanted whole.
+A writer flushes the file after each frame, so that a crash loses at most the frame in progress; the reader finds where
+the complete records end. Format: https://mcap.dev/spec. Knows nothing of topics: see `schemas`. Reads front to back
+without the index, as every reader wants the whole file.
 """
 
 import io
@@ -30,20 +30,22 @@ from mcap_protobuf.schema import register_schema
 from ..errors import OutputError, RecordingError
 
 NPZ_MEDIA_TYPE = "application/x-npz"
+RECORD_HEADER = struct.Struct("<BQ")
+"""Opcode and length that precede every MCAP record."""
 DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError)
-"""What reading a damaged record may raise: mcap's own errors, wrong sums, wrong lengths, broken compression."""
+"""Exceptions that a damaged record raises: mcap's errors, wrong checksums, wrong lengths, broken compression."""
 
 
 def truth_path(recording: Path) -> Path:
-    """Where the truth of a recording goes: run.mcap, run.truth.mcap."""
+    """Return the path of a recording's truth: run.truth.mcap for run.mcap."""
     return recording.with_suffix(".truth.mcap")
 
 
 class McapOutput:
-    """Writes messages, metadata and arrays, with the caller's times only: the wall clock never enters the file.
+    """Write messages, metadata and arrays with the caller's times only: the wall clock never enters the file.
 
     Raises:
-        OutputError: the path exists and `overwrite` is false, or it cannot be written, from whatever method finds out.
+        OutputError: the path exists and `overwrite` is false, or it cannot be written; any method may raise it.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -51,13 +53,15 @@ class McapOutput:
         if self.path.is_dir():
             raise OutputError(f"{self.path} is a folder; give a file, such as {self.path / 'run.mcap'}.")
         if self.path.exists() and not overwrite:
-            raise OutputError(f"{self.path} exists; choose another path, or allow it to be replaced (--overwrite).")
+            raise OutputError(
+                f"{self.path} exists; choose another path, or allow the file to be replaced (--overwrite)."
+            )
         try:
             self._file = open(self.path, "wb")
         except OSError as failure:
             raise OutputError(f"{self.path} cannot be written: {failure.strerror}.") from failure
         self._writer = Writer(self._file)
-        with self._disk():
+        with self._writing():
             self._writer.start(profile="")
         self._channels: dict[str, int] = {}
 
@@ -78,52 +82,52 @@ class McapOutput:
         """Write a JSON object at a time [ns]; the JSON schema's `title` names it."""
         if topic not in self._channels:
             text = json.dumps(schema, sort_keys=True).encode()
-            number = self._writer.register_schema(str(schema["title"]), SchemaEncoding.JSONSchema, text)
-            self._channels[topic] = self._writer.register_channel(topic, MessageEncoding.JSON, number)
+            schema_id = self._writer.register_schema(str(schema["title"]), SchemaEncoding.JSONSchema, text)
+            self._channels[topic] = self._writer.register_channel(topic, MessageEncoding.JSON, schema_id)
         self._add(topic, time, json.dumps(value, sort_keys=True, allow_nan=False).encode())
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """Write a metadata record, keys sorted."""
-        with self._disk():
+        """Write a metadata record with sorted keys."""
+        with self._writing():
             self._writer.add_metadata(name, dict(sorted(values.items())))
 
     def arrays(self, name: str, arrays: dict[str, np.ndarray]) -> None:
-        """Write arrays as an npz attachment; numpy dates its members 1980, so the bytes are the arrays' alone."""
+        """Write arrays as an npz attachment; numpy dates its members 1980, so the bytes depend on the arrays alone."""
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **arrays)
-        with self._disk():
+        with self._writing():
             self._writer.add_attachment(
                 create_time=0, log_time=0, name=name, media_type=NPZ_MEDIA_TYPE, data=buffer.getvalue()
             )
 
     def flush(self) -> None:
-        """Hand everything so far to the operating system, as whole records."""
-        with self._disk():
+        """Hand every record so far to the operating system."""
+        with self._writing():
             self._writer.flush()
 
     def close(self) -> None:
         """Write the index and close the file; a second call does nothing."""
         if not self._file.closed:
-            with self._disk():
+            with self._writing():
                 self._writer.finish()
                 self._file.close()
 
     def _add(self, topic: str, time: int, data: bytes) -> None:
-        with self._disk():
+        with self._writing():
             self._writer.add_message(self._channels[topic], log_time=int(time), publish_time=int(time), data=data)
 
     @contextmanager
-    def _disk(self) -> Iterator[None]:
+    def _writing(self) -> Iterator[None]:
         try:
             yield
         except OSError as failure:
             with suppress(OSError):
                 self._file.close()
-            raise OutputError(f"{self.path} cannot be written on: {failure.strerror}.") from failure
+            raise OutputError(f"{self.path} cannot be written: {failure.strerror}.") from failure
 
 
 def read_arrays(attachment: Attachment, path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz attachment.
+    """Return the arrays of an npz attachment.
 
     Raises:
         RecordingError: it is not an npz of plain arrays.
@@ -138,11 +142,11 @@ def read_arrays(attachment: Attachment, path: Path) -> dict[str, np.ndarray]:
 def iterate_records(
     path: str | os.PathLike[str], *, allow_truncated: bool = False
 ) -> Iterator[Schema | Channel | McapMessage | Metadata | Attachment]:
-    """Records in file order, one at a time, checksums verified.
+    """Yield records in file order, checksums verified.
 
     Args:
         path: an MCAP file.
-        allow_truncated: read what is whole of a file without an end, instead of refusing it.
+        allow_truncated: read the complete records of a file that was cut off, instead of refusing it.
 
     Raises:
         RecordingError: missing, not an MCAP, truncated, damaged.
@@ -154,53 +158,55 @@ def iterate_records(
         raise RecordingError(f"{path} cannot be read: {failure.strerror}.") from failure
     with file:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise RecordingError(f"{path} is not an MCAP file (it does not begin with MCAP's mark).")
-        whole, complete = _whole_length(file)
+            raise RecordingError(f"{path} is not an MCAP file (it does not begin with the magic bytes of MCAP).")
+        end, complete = _end_of_records(file)
         if not complete and not allow_truncated:
             raise RecordingError(
-                f"{path} is truncated: whole records end at byte {whole} and the MCAP footer is missing "
-                "(was the recording cut off?). Record it again, or read what is there with allow_truncated=True "
+                f"{path} is truncated: complete records end at byte {end} and the MCAP footer is missing "
+                "(was the recording cut off?). Record it again, or read its complete records with allow_truncated=True "
                 "(--allow-truncated)."
             )
         file.seek(0)
-        source = _FirstBytes(file, whole)
+        source = _FirstBytes(file, end)
         try:
             for record in StreamReader(cast(BinaryIO, source), validate_crcs=True).records:
                 if isinstance(record, Schema | Channel | McapMessage | Metadata | Attachment):
                     yield record
         except DAMAGE as failure:
-            if complete or source.left or not isinstance(failure, EndOfFile):
+            if complete or source.remaining or not isinstance(failure, EndOfFile):
                 reason = str(failure) or type(failure).__name__
-                raise RecordingError(f"{path} is damaged before byte {whole - source.left}: {reason}.") from failure
+                raise RecordingError(f"{path} is damaged before byte {end - source.remaining}: {reason}.") from failure
 
 
-def _whole_length(file: BinaryIO) -> tuple[int, bool]:
-    """Where the last whole record ends, and whether that is the file's proper end.
+def _end_of_records(file: BinaryIO) -> tuple[int, bool]:
+    """Return where the last complete record ends [byte], and whether the file ends there as MCAP demands.
 
-    Walks the lengths that precede records, reading none of them.
+    Reads the headers that precede the records, not the records.
     """
     size = file.seek(0, os.SEEK_END)
     offset = len(MCAP0_MAGIC)
-    while offset + 9 <= size:
+    while offset + RECORD_HEADER.size <= size:
         file.seek(offset)
-        opcode, length = struct.unpack("<BQ", file.read(9))
-        if offset + 9 + length > size:
+        opcode, length = RECORD_HEADER.unpack(file.read(RECORD_HEADER.size))
+        end = offset + RECORD_HEADER.size + length
+        if end > size:
             break
         if opcode == Opcode.FOOTER:
-            end = offset + 9 + length + len(MCAP0_MAGIC)
+            end += len(MCAP0_MAGIC)
             file.seek(end - len(MCAP0_MAGIC))
             return (end, True) if file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC else (offset, False)
-        offset += 9 + length
+        offset = end
     return offset, False
 
 
 class _FirstBytes:
-    """The first `left` bytes of a file, as much of a stream as mcap's reader asks for."""
+    """The first bytes of a file as a stream, with the one method that mcap's reader calls."""
 
-    def __init__(self, file: BinaryIO, left: int) -> None:
-        self._file, self.left = file, left
+    def __init__(self, file: BinaryIO, length: int) -> None:
+        self._file, self.remaining = file, length
 
     def read(self, length: int) -> bytes:
-        data = self._file.read(min(length, self.left))
-        self.left -= len(data)
+        """Return the next bytes, none past the end."""
+        data = self._file.read(min(length, self.remaining))
+        self.remaining -= len(data)
         return data

@@ -1,7 +1,7 @@
-"""Which messages of a recording belong to one moment, decided from their time stamps alone.
+"""Which messages of a recording belong to one frame, decided from their time stamps alone.
 
-Left and right images, or clouds where there are no images, make the moments; the tool's state is what it last said.
-Sensors of a robot stamp the same moment a few ms apart, hence a tolerance. Decodes nothing: see `recording`.
+Left and right images, or clouds where there are no images, make the groups; the tool's state is its latest report.
+The sensors of a robot stamp the same instant a few ms apart, hence a tolerance. Decodes nothing: see `reader`.
 """
 
 from bisect import bisect_left, bisect_right
@@ -13,25 +13,30 @@ class Stamped:
     """One message, by its own time and its place in the file."""
 
     stamp: int
-    """[ns]."""
+    """Time stamp of the message [ns]."""
     ordinal: int
-    """Number of the message in the file."""
+    """Number of the message in the file, from 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MessageGroup:
-    """The messages of one moment; None for one that is not there."""
+    """The messages that make one frame; None for one that is missing."""
 
     stamp: int
-    """[ns]."""
+    """Time stamp of the frame: that of its image or cloud [ns]."""
     left: Stamped | None = None
+    """Left image."""
     right: Stamped | None = None
+    """Right image."""
     points: Stamped | None = None
+    """Point cloud."""
     pose: Stamped | None = None
+    """Latest tool pose."""
     grasp: Stamped | None = None
+    """Latest state of the jaws."""
 
 
-def group_moments(
+def group_messages(
     *,
     left: list[Stamped],
     right: list[Stamped],
@@ -40,11 +45,12 @@ def group_moments(
     grasp: list[Stamped],
     tolerance: int,
 ) -> list[MessageGroup]:
-    """Moments in the order in which the file holds them, which need not be the order of their stamps.
+    """Group messages into frames, in the order of the file, which may differ from the order of their stamps.
 
     A left image takes the nearest right image within the tolerance that no earlier one took, and likewise a cloud.
-    A right image that nobody took is a moment of its own, so that its missing half is named. Without any image each
-    cloud is a moment. The tool's pose and grasp are the latest at most `tolerance` after the moment, however old.
+    A right image that no left image takes is a group of its own, so that its missing half is named. Without any image
+    each cloud is a group. The tool's pose and grasp are the latest ones at most `tolerance` after the group's stamp,
+    whatever their age.
 
     Args:
         left: messages of each kind, in file order.
@@ -52,7 +58,7 @@ def group_moments(
         points: see `left`.
         pose: see `left`.
         grasp: see `left`.
-        tolerance: largest difference of stamps within a moment [ns].
+        tolerance: largest difference of stamps within a group [ns].
     """
     rights, clouds = _Pool(right), _Pool(points)
     sensors: list[tuple[Stamped, MessageGroup]] = []
@@ -60,20 +66,20 @@ def group_moments(
         for image in left:
             mate, cloud = rights.take(image.stamp, tolerance), clouds.take(image.stamp, tolerance)
             sensors.append((image, MessageGroup(stamp=image.stamp, left=image, right=mate, points=cloud)))
-        sensors += [(image, MessageGroup(stamp=image.stamp, right=image)) for image in rights.unexplained()]
+        sensors += [(image, MessageGroup(stamp=image.stamp, right=image)) for image in rights.remaining()]
     else:
         sensors = [(cloud, MessageGroup(stamp=cloud.stamp, points=cloud)) for cloud in points]
     poses, grasps = sorted(pose), sorted(grasp)
     return [
         MessageGroup(
-            stamp=moment.stamp,
-            left=moment.left,
-            right=moment.right,
-            points=moment.points,
-            pose=_latest(poses, moment.stamp + tolerance),
-            grasp=_latest(grasps, moment.stamp + tolerance),
+            stamp=group.stamp,
+            left=group.left,
+            right=group.right,
+            points=group.points,
+            pose=_latest(poses, group.stamp + tolerance),
+            grasp=_latest(grasps, group.stamp + tolerance),
         )
-        for _, moment in sorted(sensors, key=lambda pair: pair[0].ordinal)
+        for _, group in sorted(sensors, key=lambda pair: pair[0].ordinal)
     ]
 
 
@@ -90,6 +96,7 @@ class _Pool:
         self._taken: set[Stamped] = set()
 
     def take(self, stamp: int, tolerance: int) -> Stamped | None:
+        """Take the message nearest to a stamp within the tolerance; None where there is none."""
         first = bisect_left(self._messages, stamp - tolerance, key=lambda message: message.stamp)
         last = bisect_right(self._messages, stamp + tolerance, key=lambda message: message.stamp)
         free = [message for message in self._messages[first:last] if message not in self._taken]
@@ -98,5 +105,6 @@ class _Pool:
             self._taken.add(nearest)
         return nearest
 
-    def unexplained(self) -> list[Stamped]:
+    def remaining(self) -> list[Stamped]:
+        """Return the messages that were not taken."""
         return [message for message in self._messages if message not in self._taken]

@@ -1,7 +1,7 @@
-"""The messages of a recording: Foxglove's protobuf schemas and one JSON schema, built from arrays and read back.
+"""The messages of a recording: Foxglove's protobuf schemas and one JSON schema, built from arrays and parsed.
 
-Schemas: https://docs.foxglove.dev/docs/sdk/schemas. Orientations leave and enter as wxyz; Foxglove's fields are named,
-so no order is assumed. Knows nothing of files or of which messages belong together: see `mcap_files`, `recording`.
+Schemas: https://docs.foxglove.dev/docs/sdk/schemas. Orientations are wxyz here; Foxglove's fields are named, so no
+order is assumed. Knows nothing of files or of which messages belong together: see `mcap_files`, `pairing`.
 """
 
 import json
@@ -20,14 +20,25 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.timestamp_pb2 import Timestamp
 from jaxtyping import Float, UInt8
 
-from ..camera import CameraCalibration, read_rotation, stated_rotation
+from ..camera import CameraCalibration, matrix_from_quaternion, rounded_quaternion
 from ..errors import RecordingError
 from ..observation import UNTURNED, ToolState
 
 WORLD = "world"
+"""Name of the world frame."""
 CAMERA_FRAMES = {"left": "camera_left_optical", "right": "camera_right_optical"}
+"""Name of each camera's raw optical frame."""
 FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-"""zlib level 1: a third of the time of the default for a tenth more bytes; the MCAP chunk is compressed besides."""
+"""zlib level 1: a third of the time of the default for a tenth more bytes; the MCAP chunk is compressed as well."""
+DISTORTION_COEFFICIENTS = (0, 4, 5, 8)
+"""Lengths of D that `plumb_bob` (up to 5) and `rational_polynomial` (8) have."""
+UNIT_LENGTH = 0.01
+"""Largest difference of a quaternion's length from 1: a robot's rounding."""
+SHOWN_BYTES = 80
+"""How much of a malformed message an error shows."""
+NS_PER_S = 1_000_000_000
+"""Nanoseconds in a second."""
+
 
 GRASP_SCHEMA: dict[str, object] = {
     "title": "jiggle_mj.Grasp",
@@ -37,7 +48,10 @@ GRASP_SCHEMA: dict[str, object] = {
         "grasp": {"type": "integer", "description": "number of the current or last grasp, from 1; 0 before the first"},
         "radius": {"type": "number", "description": "tissue within this distance of the tip is held [m]"},
         "held_tracks": {"type": "array", "items": {"type": "integer"}, "description": "track ids known to be held"},
-        "by_points": {"type": "boolean", "description": "whether the pose is where the held points were seen"},
+        "by_points": {
+            "type": "boolean",
+            "description": "whether the pose is where the held points were seen",
+        },
     },
     "required": ["closed", "grasp", "radius"],
 }
@@ -52,26 +66,27 @@ FIELD_TYPES: dict[str, "PackedElementField.NumericType.ValueType"] = {
     "|i1": PackedElementField.INT8,
     "|u1": PackedElementField.UINT8,
 }
-"""numpy's little-endian types and PointCloud's."""
+"""numpy's little-endian types to the types of PointCloud."""
 FIELD_FORMATS = {number: name for name, number in FIELD_TYPES.items()}
+"""The types of PointCloud to numpy's."""
 
 RAW_ENCODINGS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "8UC3": 3, "8UC1": 1}
-"""Encodings of RawImage that are read, and their channels; 8UC3 is BGR, as Foxglove reads it."""
+"""Encodings of RawImage that are read, and their number of channels; 8UC3 is BGR, as Foxglove reads it."""
 
 
 def timestamp(time: int) -> Timestamp:
-    """Protobuf timestamp of a time [ns]."""
-    seconds, nanos = divmod(int(time), 1_000_000_000)
+    """Return the protobuf timestamp of a time [ns]."""
+    seconds, nanos = divmod(int(time), NS_PER_S)
     return Timestamp(seconds=seconds, nanos=nanos)
 
 
 def stamp_of(message: Any) -> int:
-    """A message's own time [ns]; 0 where it carries none."""
-    return message.timestamp.seconds * 1_000_000_000 + message.timestamp.nanos
+    """Return a message's own time [ns]; 0 where it has none."""
+    return message.timestamp.seconds * NS_PER_S + message.timestamp.nanos
 
 
 def image_message(time: int, image: UInt8[np.ndarray, "height width 3"], side: str) -> CompressedImage:
-    """A lossless png of an RGB image of the `left` or `right` camera."""
+    """Return a lossless png of an RGB image of the `left` or `right` camera."""
     encoded, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), FAST_PNG)
     if not encoded:
         raise ValueError(f"an image of shape {image.shape} cannot be written as png.")
@@ -79,7 +94,7 @@ def image_message(time: int, image: UInt8[np.ndarray, "height width 3"], side: s
 
 
 def decode_image(message: CompressedImage | RawImage) -> UInt8[np.ndarray, "height width 3"]:
-    """The RGB image of a message.
+    """Return the RGB image of a message.
 
     Raises:
         RecordingError: the data cannot be decoded, or the encoding is not one of `RAW_ENCODINGS`.
@@ -104,9 +119,13 @@ def decode_image(message: CompressedImage | RawImage) -> UInt8[np.ndarray, "heig
 
 
 def calibration_message(calibration: CameraCalibration, side: str) -> CalibrationMessage:
-    """One camera's calibration at time 0."""
+    """Return the message of one camera's calibration, at time 0.
+
+    Raises:
+        ValueError: D has a length that no distortion model has.
+    """
     n_coefficients = len(calibration.D)
-    if n_coefficients not in (0, 4, 5, 8):
+    if n_coefficients not in DISTORTION_COEFFICIENTS:
         raise ValueError(f"CameraCalibration.D must have 0, 4, 5 or 8 coefficients; got {n_coefficients}.")
     return CalibrationMessage(
         timestamp=timestamp(0),
@@ -122,7 +141,7 @@ def calibration_message(calibration: CameraCalibration, side: str) -> Calibratio
 
 
 def parse_calibration(message: CalibrationMessage, topic: str) -> CameraCalibration:
-    """The calibration in a message.
+    """Return the calibration in a message.
 
     Raises:
         RecordingError: uncalibrated, a fisheye model, or matrices of the wrong length.
@@ -152,15 +171,15 @@ def parse_calibration(message: CalibrationMessage, topic: str) -> CameraCalibrat
 
 
 def frame_transform(parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]) -> FrameTransform:
-    """The pose of a child frame in its parent, at time 0."""
+    """Return the message of a child frame's pose in its parent, at time 0."""
     message = FrameTransform(timestamp=timestamp(0), parent_frame_id=parent, child_frame_id=child)
     _fill(message.translation, "xyz", T_parent_child[:3, 3])
-    _fill(message.rotation, "wxyz", stated_rotation(T_parent_child[:3, :3]))
+    _fill(message.rotation, "wxyz", rounded_quaternion(T_parent_child[:3, :3]))
     return message
 
 
 def parse_transform(message: FrameTransform | Pose) -> Float[np.ndarray, "4 4"]:
-    """The matrix of a transform or pose; an unset rotation is none.
+    """Return the matrix of a transform or pose; an unset rotation is the identity.
 
     Raises:
         RecordingError: numbers that are not finite, or a quaternion that is not of unit length.
@@ -173,43 +192,43 @@ def parse_transform(message: FrameTransform | Pose) -> Float[np.ndarray, "4 4"]:
         quat_wxyz = UNTURNED
     refuse_bad_pose(position, quat_wxyz)
     T = np.eye(4)
-    T[:3, :3] = read_rotation(quat_wxyz)
+    T[:3, :3] = matrix_from_quaternion(quat_wxyz)
     T[:3, 3] = position
     return T
 
 
 def refuse_bad_pose(position: Float[np.ndarray, " 3"], quat_wxyz: Float[np.ndarray, " 4"]) -> None:
-    """Refuse a pose that is not one.
+    """Refuse a malformed pose.
 
     Raises:
-        RecordingError: NaN or infinity, or a quaternion whose length is not 1 within 1 % (a robot's rounding).
+        RecordingError: NaN or infinity, or a quaternion whose length differs from 1 by more than `UNIT_LENGTH`.
     """
     if not (np.isfinite(position).all() and np.isfinite(quat_wxyz).all()):
         raise RecordingError(f"NaN in the pose: position {position.tolist()}, quaternion wxyz {quat_wxyz.tolist()}")
-    if abs(np.linalg.norm(quat_wxyz) - 1) > 0.01:
+    if abs(np.linalg.norm(quat_wxyz) - 1) > UNIT_LENGTH:
         raise RecordingError(f"the pose's quaternion wxyz {quat_wxyz.tolist()} is not of unit length")
 
 
 def pose_message(time: int, tool: ToolState) -> PoseInFrame:
-    """The tip's pose in the world."""
+    """Return the message of the tip's pose in the world at a time [ns]."""
     message = PoseInFrame(timestamp=timestamp(time), frame_id=WORLD)
     fill_pose(message.pose, tool.position, tool.quat_wxyz)
     return message
 
 
 def grasp_json(tool: ToolState) -> dict[str, object]:
-    """The jaws' state, after `GRASP_SCHEMA`."""
-    said: dict[str, object] = {
+    """Return the message of the jaws' state, which follows `GRASP_SCHEMA`."""
+    message: dict[str, object] = {
         "closed": bool(tool.closed),
         "grasp": int(tool.grasp),
         "radius": float(tool.radius),
         "held_tracks": [int(track) for track in tool.held_tracks],
     }
-    return said | {"by_points": True} if tool.by_points else said
+    return message | {"by_points": True} if tool.by_points else message
 
 
 def parse_grasp(data: bytes) -> dict[str, Any]:
-    """The fields of a grasp message.
+    """Return the fields of a grasp message.
 
     Raises:
         RecordingError: not JSON, or a field missing or of the wrong kind.
@@ -228,12 +247,12 @@ def parse_grasp(data: bytes) -> dict[str, Any]:
     except (KeyError, TypeError, ValueError) as failure:
         raise RecordingError(
             "/tool/grasp must be JSON {closed, grasp, radius}, and held_tracks and by_points where they are known; "
-            f"got {data[:80]!r} ({failure!r})."
+            f"got {data[:SHOWN_BYTES]!r} ({failure!r})."
         ) from failure
 
 
 def point_cloud(time: int, columns: dict[str, np.ndarray], *, frame_id: str = WORLD) -> PointCloud:
-    """A PointCloud with the named columns, each of shape (m,), in their own types (bool as uint8, int as int32)."""
+    """Return a PointCloud with the named columns of shape (m,) in their own types (bool as uint8, int as int32)."""
     typed = {name: _packable(name, column) for name, column in columns.items()}
     table = np.zeros(len(next(iter(typed.values()))), dtype=[(name, column.dtype) for name, column in typed.items()])
     for name, column in typed.items():
@@ -248,10 +267,10 @@ def point_cloud(time: int, columns: dict[str, np.ndarray], *, frame_id: str = WO
 
 
 def parse_points(message: PointCloud, topic: str) -> dict[str, np.ndarray]:
-    """The columns of a PointCloud, its own pose not applied.
+    """Return the columns of a PointCloud; its own pose is not applied.
 
     Raises:
-        RecordingError: no x, y, z, a field outside its point, or data that is no whole number of points.
+        RecordingError: no x, y, z, a field outside its point, or data whose length is not a multiple of a point's.
     """
     known = {f.name: (FIELD_FORMATS[f.type], f.offset) for f in message.fields if f.type in FIELD_FORMATS}
     missing = [name for name in "xyz" if name not in known]
@@ -274,7 +293,7 @@ def parse_points(message: PointCloud, topic: str) -> dict[str, np.ndarray]:
 
 
 def fill_pose(pose: Pose, position: Float[np.ndarray, " 3"], quat_wxyz: Float[np.ndarray, " 4"] = UNTURNED) -> None:
-    """Fill in a pose, zeros included: a viewer takes a part that is not there for one that is missing."""
+    """Set every field of a pose, zeros included: a viewer treats an unset part as a missing one."""
     _fill(pose.position, "xyz", position)
     _fill(pose.orientation, "wxyz", quat_wxyz)
 

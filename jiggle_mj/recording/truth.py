@@ -1,6 +1,6 @@
-"""The truth of a recording, in a file of its own under `/truth/` topics, which every reader of observations refuses.
+"""The truth of a recording, in a separate file under `/truth/` topics, which every reader of observations refuses.
 
-Written by whoever makes the tissue, frame by frame; read by `jiggle_mj.eval` only.
+The reference tissue or an importer writes it; only `jiggle_mj.eval` reads it.
 """
 
 import json
@@ -21,8 +21,10 @@ from .declaration import METADATA, file_metadata
 from .mcap_files import McapOutput, iterate_records, read_arrays
 from .schemas import WORLD, fill_pose, parse_points, point_cloud, timestamp
 
-REST, POINTS, TOOL, FRAME = "/truth/rest", "/truth/points", "/truth/tool", "/truth/frame"
+TRUTH_REST, TRUTH_POINTS, TRUTH_TOOL, TRUTH_FRAME = "/truth/rest", "/truth/points", "/truth/tool", "/truth/frame"
+"""Topics."""
 DETAILS, FACES = "truth", "truth_faces.npz"
+"""Names of a metadata record and of an attachment."""
 FRAME_SCHEMA: dict[str, object] = {
     "title": "jiggle_mj.TruthFrame",
     "type": "object",
@@ -32,17 +34,17 @@ FRAME_SCHEMA: dict[str, object] = {
 
 
 class TruthWriter:
-    """Writes the truth as it comes; what is written survives a crash.
+    """Write the truth to a file as it comes; what is written survives a crash.
 
     Args:
         path: the file to write.
         rest: rest positions on the visible surface [m].
-        faces: triangles.
+        faces: vertex numbers of each triangle, from 0.
         attached: which vertices are attached at the start.
         scene: name of the scene or recording.
-        identity: of the recording, as its metadata has it.
-        details: anything else, JSON-serialisable.
-        overwrite: replace a file that is there.
+        identity: identity of the recording, as its metadata has it.
+        details: further entries, JSON-serialisable.
+        overwrite: replace an existing file.
 
     Raises:
         OutputError: the path exists, or cannot be written.
@@ -60,13 +62,13 @@ class TruthWriter:
         identity: str = "",
         overwrite: bool = False,
     ) -> None:
-        self._said = {"scene": scene, "identity": identity}
+        self._origin = {"scene": scene, "identity": identity}
         self._output = McapOutput(path, overwrite=overwrite)
         self._output.metadata(METADATA, file_metadata())
         self.conclude(details)
         self._output.arrays(FACES, {"faces": np.asarray(faces)})
         columns = dict(zip("xyz", np.asarray(rest, float).T, strict=True)) | {"attached": np.asarray(attached)}
-        self._output.message(REST, 0, point_cloud(0, columns))
+        self._output.message(TRUTH_REST, 0, point_cloud(0, columns))
         self._output.flush()
 
     def __enter__(self) -> Self:
@@ -82,16 +84,16 @@ class TruthWriter:
         columns["stiffness"] = np.asarray(frame.stiffness, float)
         if frame.load is not None:
             columns["load"] = np.asarray(frame.load, float)
-        output.message(POINTS, time, point_cloud(time, columns))
+        output.message(TRUTH_POINTS, time, point_cloud(time, columns))
         tool = PoseInFrame(timestamp=timestamp(time), frame_id=WORLD)
         fill_pose(tool.pose, frame.tip)
-        output.message(TOOL, time, tool)
-        output.json(FRAME, time, {"index": int(frame.index)}, schema=FRAME_SCHEMA)
+        output.message(TRUTH_TOOL, time, tool)
+        output.json(TRUTH_FRAME, time, {"index": int(frame.index)}, schema=FRAME_SCHEMA)
         output.flush()
 
     def conclude(self, details: dict[str, object]) -> None:
-        """Write the details, once more with what only the end could know; a reader takes the last."""
-        self._output.metadata(DETAILS, self._said | {"details": json.dumps(details, sort_keys=True)})
+        """Write the details again, with what is known only at the end; a reader takes the last ones."""
+        self._output.metadata(DETAILS, self._origin | {"details": json.dumps(details, sort_keys=True)})
 
     def close(self) -> None:
         """Write the index and close the file."""
@@ -99,7 +101,7 @@ class TruthWriter:
 
 
 def write_truth(path: str | os.PathLike[str], truth: Truth, *, overwrite: bool = False) -> None:
-    """Write a whole truth.
+    """Write a complete truth.
 
     Raises:
         OutputError: the path exists, or cannot be written.
@@ -119,15 +121,15 @@ def write_truth(path: str | os.PathLike[str], truth: Truth, *, overwrite: bool =
 
 
 def read_truth(path: str | os.PathLike[str], *, allow_truncated: bool = False) -> Truth:
-    """Read a truth file.
+    """Read a truth file and return its contents.
 
     Raises:
         RecordingError: missing, not an MCAP, truncated, damaged, or not a truth file.
     """
     path = Path(path)
     topics: dict[int, str] = {}
-    messages: dict[str, list[Message]] = {REST: [], POINTS: [], TOOL: [], FRAME: []}
-    faces, said = None, {}
+    messages: dict[str, list[Message]] = {TRUTH_REST: [], TRUTH_POINTS: [], TRUTH_TOOL: [], TRUTH_FRAME: []}
+    faces, origin = None, {}
     for record in iterate_records(path, allow_truncated=allow_truncated):
         if isinstance(record, Channel):
             topics[record.id] = record.topic
@@ -136,25 +138,25 @@ def read_truth(path: str | os.PathLike[str], *, allow_truncated: bool = False) -
         elif isinstance(record, Attachment) and record.name == FACES:
             faces = read_arrays(record, path)["faces"]
         elif isinstance(record, Metadata) and record.name == DETAILS:
-            said = record.metadata
-    if not messages[REST] or faces is None or not said:
-        found = ", ".join(sorted(set(topics.values()))) or "none"
-        raise RecordingError(f"{path} is not a truth file: it needs {REST} and {FACES}; its topics are: {found}.")
-    rest = parse_points(PointCloud.FromString(messages[REST][0].data), REST)
-    frames = zip(messages[POINTS], messages[TOOL], messages[FRAME], strict=False)
+            origin = record.metadata
+    if not messages[TRUTH_REST] or faces is None or not origin:
+        names = ", ".join(sorted(set(topics.values()))) or "none"
+        raise RecordingError(f"{path} is not a truth file: it needs {TRUTH_REST} and {FACES}; its topics are: {names}.")
+    rest = parse_points(PointCloud.FromString(messages[TRUTH_REST][0].data), TRUTH_REST)
+    frames = zip(messages[TRUTH_POINTS], messages[TRUTH_TOOL], messages[TRUTH_FRAME], strict=False)
     return Truth(
         rest=_positions(rest),
         faces=faces,
         attached=rest["attached"].astype(bool),
         frames=tuple(_parse_frame(*frame) for frame in frames),
-        scene=said["scene"],
-        identity=said.get("identity", ""),
-        details=json.loads(said["details"]),
+        scene=origin["scene"],
+        identity=origin.get("identity", ""),
+        details=json.loads(origin["details"]),
     )
 
 
 def _parse_frame(points: Message, tool: Message, frame: Message) -> TruthFrame:
-    columns = parse_points(PointCloud.FromString(points.data), POINTS)
+    columns = parse_points(PointCloud.FromString(points.data), TRUTH_POINTS)
     tip = PoseInFrame.FromString(tool.data).pose.position
     return TruthFrame(
         index=json.loads(frame.data)["index"],

@@ -11,8 +11,9 @@ from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.observation import Declaration
 from jiggle_mj.recording.mcap_files import truth_path
-from jiggle_mj.recording.reader import Recording, RecordingWriter
+from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
+from jiggle_mj.recording.writer import RecordingWriter
 from jiggle_mj.scenes import Reference, load_scene, programme
 from tests.support.tiny_scene import scene_file
 
@@ -50,7 +51,7 @@ def test_a_scrambled_truth_leaves_the_estimate_equal_to_the_byte(recording, tmp_
 
 
 def test_the_recording_gives_the_same_estimate_as_the_live_tissue(recording, tmp_path):
-    """What is estimated while the tissue moves = what is estimated from the file."""
+    """The estimate during the simulation equals the estimate from the file, byte by byte."""
     path, seen = recording
     opened = Recording.open(path)
     estimate(seen, Estimator(opened.declaration, opened.camera), tmp_path / "live.mcap")
@@ -64,8 +65,8 @@ def test_the_truth_file_is_no_recording(recording):
 
 def test_every_action_is_one_frame_of_recording_and_truth(recording):
     path, seen = recording
-    indices = [one.index for one in seen]
-    assert [one.index for one in Recording.open(path)] == indices
+    indices = [observation.index for observation in seen]
+    assert [observation.index for observation in Recording.open(path)] == indices
     assert [frame.index for frame in read_truth(truth_path(path)).frames] == indices
 
 
@@ -77,13 +78,14 @@ def test_frames_without_closed_jaws_cannot_be_estimated(tmp_path):
             estimate(frames, Estimator(reference.declaration))
 
 
-def test_frames_that_the_recording_skips_are_named_when_none_is_left(recording, tmp_path):
-    """A tool pose is NaN in every frame: that is the reason, not open jaws."""
+def test_frames_that_the_recording_skips_are_named_when_none_remains(recording, tmp_path):
+    """The tool pose is NaN in every frame: the error names that reason, not open jaws."""
     _, seen = recording
     path = tmp_path / "blind.mcap"
     with RecordingWriter(path, camera=None, declaration=Declaration(), metadata={}) as writer:
-        for one in seen[:4]:
-            writer.write(replace(one, tool=replace(one.tool, position=np.full(3, np.nan))))
+        for observation in seen[:4]:
+            blind = replace(observation.tool, position=np.full(3, np.nan))
+            writer.write(replace(observation, tool=blind))
     opened = Recording.open(path)
     with pytest.raises(PerceptionError, match="frame 0: NaN"):
         estimate(opened, Estimator(opened.declaration))
@@ -91,13 +93,13 @@ def test_frames_that_the_recording_skips_are_named_when_none_is_left(recording, 
 
 def test_frames_skipped_by_recording_and_estimator_are_counted_together(recording, tmp_path):
     _, seen = recording
-    first = next(one for one in seen if one.tool.closed)
+    first = next(observation for observation in seen if observation.tool.closed)
     lost = replace(first, index=first.index + 1, tool=replace(first.tool, position=np.full(3, np.nan)))
     nowhere = replace(first.points, positions=np.full_like(first.points.positions, np.nan))
     hidden = replace(seen[lost.index + 1], points=nowhere)
     with RecordingWriter(tmp_path / "gaps.mcap", camera=None, declaration=Declaration(), metadata={}) as writer:
-        for one in (*seen[: lost.index], replace(lost, time=seen[lost.index].time), hidden):
-            writer.write(one)
+        for observation in (*seen[: lost.index], replace(lost, time=seen[lost.index].time), hidden):
+            writer.write(observation)
     opened = Recording.open(tmp_path / "gaps.mcap")
     episode = estimate(opened, Estimator(opened.declaration))
     assert [index for index, _ in episode.skipped] == [lost.index, hidden.index]

@@ -48,7 +48,7 @@ def lifted(gravity: float) -> tuple[np.ndarray, ...]:
     energy = eqx.tree_at(
         lambda e: e.terms[kinds.index(Weight)].gravity, sheet_energy(), replace_fn=lambda g: gravity * g
     )
-    balance, k = sheet_balance(1e-4).of(energy), DECLARATION.membrane_stiffness
+    balance, k = sheet_balance(1e-4).with_energy(energy), DECLARATION.membrane_stiffness
     s, states = jnp.asarray(attached() * STIFFNESS / (STIFFNESS + k)), []
     first = {lift.grasp: lift.tip for lift in lifts()[::-1]}
     predict = eqx.filter_jit(balance.predict)

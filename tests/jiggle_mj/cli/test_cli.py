@@ -1,4 +1,4 @@
-"""The command line: exit codes, what goes to stdout, what is refused, and one whole run."""
+"""The command line: exit codes, what goes to stdout, what is refused, and one complete run."""
 
 import json
 import shutil
@@ -12,13 +12,19 @@ import pytest
 from tests.support.result_keys import KEYS, keys
 from tests.support.tiny_scene import SCENE, call, scene_file
 
+MIN_COVERAGE = 0.95
+"""Least PCD and PUG within a ring of the mesh, as in `test_main_job`."""
+MAX_TRACKING_RMS = 0.6e-3
+"""Largest RMS distance of seen particles from their material points [m], as in `test_main_job`."""
+SAME_RUN = 1e-12
+"""Relative difference of a figure that is computed from an estimate in memory and from its file."""
 FILES = {"run.mcap", "run.truth.mcap", "estimate.mcap", "result.json", "report.html"}
 
 
 @pytest.fixture(scope="module", params=[pytest.param("stereo", marks=pytest.mark.render)])
-def whole(request, tmp_path_factory):
+def complete_run(request, tmp_path_factory):
     """`run` on a tiny scene, from images: exit code, scene and folder."""
-    folder = tmp_path_factory.mktemp("whole")
+    folder = tmp_path_factory.mktemp("complete_run")
     monkeypatch = pytest.MonkeyPatch()
     scene, out = scene_file(folder, text=SCENE.replace("spacing = 7e-3", "spacing = 4.5e-3")), folder / "out"
     with monkeypatch.context() as patch:
@@ -35,15 +41,15 @@ def particles(tmp_path_factory):
     return folder / "run.mcap"
 
 
-def test_run_fills_the_folder_with_five_files(whole):
-    code, _, out = whole
+def test_run_fills_the_folder_with_five_files(complete_run):
+    code, _, out = complete_run
     assert code == 0
     assert {path.name for path in out.iterdir()} == FILES
     assert "<html" in (out / "report.html").read_text()[:500]
 
 
-def test_result_json_has_exactly_the_stated_keys(whole):
-    _, _, out = whole
+def test_result_json_has_exactly_the_documented_keys(complete_run):
+    _, _, out = complete_run
     figures = json.loads((out / "result.json").read_text())
     assert keys(figures) == KEYS
     assert figures["scene"] == "tiny" and figures["sensing"] == "stereo"
@@ -51,18 +57,18 @@ def test_result_json_has_exactly_the_stated_keys(whole):
     assert figures["detection"]["n_attached"] > 0
 
 
-def test_the_disc_of_the_tiny_scene_is_found_from_images_alone(whole):
-    """All that is reported lies within a ring of it and covers it within a ring; the report has pictures."""
-    figures = json.loads((whole[2] / "result.json").read_text())
+def test_the_disc_of_the_tiny_scene_is_found_from_images_alone(complete_run):
+    """The reported particles lie within a ring of the disc and cover it within a ring; the report has pictures."""
+    figures = json.loads((complete_run[2] / "result.json").read_text())
     ring = figures["detection"]["by_dilation"]["1"]
-    assert ring["pcd"] >= 0.95 and ring["pug"] >= 0.95
-    assert figures["tracking"]["rms_m"] <= 0.6e-3
-    page = (whole[2] / "report.html").read_text()
+    assert ring["pcd"] >= MIN_COVERAGE and ring["pug"] >= MIN_COVERAGE
+    assert figures["tracking"]["rms_m"] <= MAX_TRACKING_RMS
+    page = (complete_run[2] / "report.html").read_text()
     assert "data:image/jpeg" in page and "Reliability of P(attached)" in page
 
 
-def test_estimate_then_score_with_json_print_json_and_nothing_else(whole, tmp_path, monkeypatch, capsys):
-    _, _, made = whole
+def test_estimate_then_score_with_json_print_json_and_nothing_else(complete_run, tmp_path, monkeypatch, capsys):
+    _, _, made = complete_run
     out = tmp_path / "again"
     assert call(monkeypatch, "estimate", made / "run.mcap", "--out", out, "--json") == 0
     printed = capsys.readouterr()
@@ -74,13 +80,13 @@ def test_estimate_then_score_with_json_print_json_and_nothing_else(whole, tmp_pa
     scored = json.loads(capsys.readouterr().out)
     reference = json.loads((made / "result.json").read_text())
     assert scored["detection"] == reference["detection"]
-    assert np.isclose(scored["tracking"]["rms_m"], reference["tracking"]["rms_m"], rtol=1e-12)
+    assert np.isclose(scored["tracking"]["rms_m"], reference["tracking"]["rms_m"], rtol=SAME_RUN)
 
 
 def test_a_truth_of_the_same_name_but_another_scene_is_refused_and_changes_nothing(
-    whole, tmp_path, monkeypatch, capsys
+    complete_run, tmp_path, monkeypatch, capsys
 ):
-    _, scene, made = whole
+    _, scene, made = complete_run
     moved = tmp_path / scene.name
     moved.write_text(scene.read_text().replace("centre = [0.0, 0.0]", "centre = [0.01, 0.0]"))
     assert call(monkeypatch, "record", moved, "--out", tmp_path / "run.mcap", "--sensing", "particles") == 0
@@ -107,17 +113,17 @@ def test_a_folder_with_results_is_refused_with_2_and_replaced_on_demand(particle
 
 def test_identify_prints_ratios_and_what_it_refuses(particles, monkeypatch, capsys):
     assert call(monkeypatch, "identify", particles, "--json") == 0
-    told = capsys.readouterr()
-    found = json.loads(told.out)
-    assert set(found["ratios"]) == {"weight", "bending"} and "membrane stiffness" in found["refused"]
-    for name, ratio in found["ratios"].items():
+    printed = capsys.readouterr()
+    material = json.loads(printed.out)
+    assert set(material["ratios"]) == {"weight", "bending"} and "membrane stiffness" in material["refused"]
+    for name, ratio in material["ratios"].items():
         assert ratio["factor"] > 0 and ratio["log_sd"] > 0
-        assert (ratio["refused"] is not None) == (name in found["refused"])
-    assert "membrane stiffness: not identified" in told.err and "1/m" in told.err
+        assert (ratio["refused"] is not None) == (name in material["refused"])
+    assert "membrane stiffness: not identified" in printed.err and "1/m" in printed.err
 
 
-def test_a_run_that_cannot_begin_leaves_the_old_results(whole, monkeypatch, capsys):
-    _, scene, made = whole
+def test_a_run_that_cannot_begin_leaves_the_old_results(complete_run, monkeypatch, capsys):
+    _, scene, made = complete_run
     before = {path.name: path.read_bytes() for path in made.iterdir()}
     arguments = ("run", scene, "--out", made, "--overwrite", "--seed", "-1")
     assert call(monkeypatch, *arguments) == 2
@@ -131,15 +137,15 @@ def one_line(text: str) -> str:
     return lines[0]
 
 
-def test_estimating_from_the_truth_is_refused_in_one_line(whole, tmp_path, monkeypatch, capsys):
-    code = call(monkeypatch, "estimate", whole[2] / "run.truth.mcap", "--out", tmp_path / "cheat")
+def test_estimating_from_the_truth_is_refused_in_one_line(complete_run, tmp_path, monkeypatch, capsys):
+    code = call(monkeypatch, "estimate", complete_run[2] / "run.truth.mcap", "--out", tmp_path / "cheat")
     assert code == 1
     assert "truth" in one_line(capsys.readouterr().err)
     assert not (tmp_path / "cheat").exists()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "says"),
+    ("arguments", "code", "name"),
     [
         (("run", "nosuchscene", "--out", "x"), 2, "nosuchscene"),
         (("run", "nosuch.toml", "--out", "x"), 2, r"nosuch.toml"),
@@ -148,11 +154,11 @@ def test_estimating_from_the_truth_is_refused_in_one_line(whole, tmp_path, monke
         (("import", "nosuchfolder", "--out", "x.mcap"), 1, "nosuchfolder"),
     ],
 )
-def test_what_is_not_there_is_named_in_one_line(arguments, code, says, tmp_path, monkeypatch, capsys):
+def test_what_is_not_there_is_named_in_one_line(arguments, code, name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert call(monkeypatch, *arguments) == code
     printed = capsys.readouterr()
-    assert says in one_line(printed.err)
+    assert name in one_line(printed.err)
     assert printed.out == ""
     assert list(tmp_path.iterdir()) == []
 
@@ -174,8 +180,8 @@ def test_without_opengl_the_message_says_what_to_install(tmp_path, monkeypatch, 
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_record_writes_observations_and_truth_apart(whole, tmp_path, monkeypatch, capsys):
-    _, scene, made = whole
+def test_record_writes_observations_and_truth_to_two_files(complete_run, tmp_path, monkeypatch, capsys):
+    _, scene, made = complete_run
     out = tmp_path / "run.mcap"
     assert call(monkeypatch, "record", scene, "--out", out, "--json") == 0
     written = json.loads(capsys.readouterr().out)
@@ -195,14 +201,14 @@ def test_the_module_can_be_run():
 
 
 @pytest.mark.slow
-def test_close_loop_writes_what_it_found_and_a_page(whole, tmp_path, monkeypatch, capsys):
-    _, _, made = whole
+def test_close_loop_writes_a_verdict_and_a_page(complete_run, tmp_path, monkeypatch, capsys):
+    _, _, made = complete_run
     arguments = (made / "run.mcap", "--truth", made / "run.truth.mcap", "--out", tmp_path / "closed", "--json")
     assert call(monkeypatch, "close-loop", *arguments) == 0
     printed = capsys.readouterr()
-    found = json.loads(printed.out)
-    assert found == json.loads((tmp_path / "closed" / "discrepancy.json").read_text())
-    assert found["detection_after"]["n_attached"] > 0
-    assert "scores: " in printed.err and found["verdict"] in printed.err
-    assert found["verdict"] in (tmp_path / "closed" / "discrepancy.html").read_text()
-    assert call(monkeypatch, "close-loop", *arguments) == 2  # what is there is not replaced unasked
+    discrepancy = json.loads(printed.out)
+    assert discrepancy == json.loads((tmp_path / "closed" / "discrepancy.json").read_text())
+    assert discrepancy["detection_after"]["n_attached"] > 0
+    assert "scores: " in printed.err and discrepancy["verdict"] in printed.err
+    assert discrepancy["verdict"] in (tmp_path / "closed" / "discrepancy.html").read_text()
+    assert call(monkeypatch, "close-loop", *arguments) == 2  # existing results are not replaced without --overwrite

@@ -1,0 +1,103 @@
+"""Writing observations to a recording: an MCAP file that holds what an estimator may see, and nothing else.
+
+The topics are in docs/RECORDINGS.md; `reader` reads them back.
+"""
+
+import os
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+
+from ..camera import StereoCamera
+from ..observation import Declaration, MeasuredPoints, Observation
+from .contents import EVENT, GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
+from .declaration import METADATA, file_metadata, write_declaration
+from .events import EVENT_SCHEMA, event_json
+from .frames import camera_transforms
+from .mcap_files import McapOutput
+from .schemas import (
+    GRASP_SCHEMA,
+    calibration_message,
+    grasp_json,
+    image_message,
+    point_cloud,
+    pose_message,
+)
+
+
+class RecordingWriter:
+    """Write observations to a file as they come; what is written survives a crash.
+
+    Args:
+        path: the file to write.
+        camera: the camera that takes the images; None for a recording of points.
+        declaration: what the user says is known.
+        metadata: entries of the caller, such as the seed.
+        overwrite: replace an existing file.
+
+    Raises:
+        OutputError: the path exists, or cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        camera: StereoCamera | None,
+        declaration: Declaration,
+        metadata: dict[str, str],
+        overwrite: bool = False,
+    ) -> None:
+        self._camera = camera
+        self._output = McapOutput(path, overwrite=overwrite)
+        self._output.metadata(METADATA, file_metadata() | metadata)
+        write_declaration(self._output, declaration)
+        if camera is not None:
+            self._output.message(LEFT_INFO, 0, calibration_message(camera.left, "left"))
+            self._output.message(RIGHT_INFO, 0, calibration_message(camera.right, "right"))
+            self._output.message(TF, 0, camera_transforms(camera))
+        self._output.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
+
+    def write(self, observation: Observation) -> None:
+        """Write one observation, and hand it to the operating system.
+
+        Raises:
+            ValueError: the observation has images, and the writer has no camera.
+        """
+        output, time = self._output, observation.time
+        for report in observation.reports:
+            at_report = replace(observation.tool, position=report.position)
+            output.message(POSE, report.time, pose_message(report.time, at_report))
+        output.message(POSE, time, pose_message(time, observation.tool))
+        output.json(GRASP, time, grasp_json(observation.tool), schema=GRASP_SCHEMA)
+        for event in observation.events:
+            output.json(EVENT, time, event_json(event), schema=EVENT_SCHEMA)
+        if observation.images is not None:
+            if self._camera is None:
+                raise ValueError("RecordingWriter.camera is None, and the observation has images; give the camera.")
+            output.message(LEFT, time, image_message(time, observation.images.left, "left"))
+            output.message(RIGHT, time, image_message(time, observation.images.right, "right"))
+        if observation.points is not None:
+            output.message(POINTS, time, _points_message(time, observation.points))
+        output.flush()
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        self._output.close()
+
+
+def _points_message(time: int, points: MeasuredPoints) -> PointCloud:
+    columns: dict[str, np.ndarray] = dict(zip("xyz", np.asarray(points.positions, float).T, strict=True))
+    if points.track_id is not None:
+        columns["track_id"] = points.track_id
+    columns["sd"] = np.full(len(points.positions), points.sd)
+    return point_cloud(time, columns)

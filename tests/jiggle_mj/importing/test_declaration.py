@@ -1,0 +1,56 @@
+"""A recording.toml with a mistake is refused, with key, value and what is allowed."""
+
+import pytest
+
+from jiggle_mj.errors import RecordingError
+from jiggle_mj.importing.folder import import_folder
+from tests.support.measured_folder import TOML, bring_in, folder
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('unit = "mm"', 'unit = "inch"', "unit must be one of m, cm, mm; got 'inch'"),
+        ('unit = "mm"', "", "lacks the key 'unit'"),
+        ("period = 0.5", "period = 0", "period must be a number above 0; got 0"),
+        ('name = "grid"', "name = 3", "name must be a text; got 3"),
+        ('name = "grid"', 'name = "grid"\nunits = "mm"', "unknown key 'units'; known: declaration, frame, grasp"),
+        (
+            "rows = [0, 1]",
+            "rows = [0, 1]\ntip = 3",
+            r"\[grasp\] has the unknown key 'tip'; known: after, direction, radius",
+        ),
+        ("bed = false", "bed = 0", r"\[declaration\] bed must be true or false; got 0"),
+        ("bed = false", "youngs = 3.0", r"\[declaration\] has the unknown key 'youngs'; known: areal_density"),
+        ("bed = false", "poisson = 0.5", r"\[declaration\] Declaration.poisson must be in \[0, 0.5\)"),
+        ("bed = false", "thickness = 0", r"\[declaration\] Declaration.thickness must be above 0"),
+        ("rows = [0, 1]", "", r"\[grasp\] needs rows or rows_file, or start, direction and step"),
+        ("rows = [0, 1]", 'rows = [0]\nrows_file = "r"', "both rows and rows_file"),
+        ("rows = [0, 1]", "rows = [12]", r"grasp names row 12; rows are numbered 0\.\.11"),
+        ("rows = [0, 1]", "rows = []", "grasp names row none"),
+        ("rows = [0, 1]", 'rows_file = "rest.xyz"', "must hold whole numbers"),
+        ("attached_rows = [11, 12]", "attached_rows = [0]", r"\[truth\] names row 0; rows are numbered 1\.\.12"),
+        ("attached_rows = [11, 12]", "attached_beyond = 1.0", r"\[truth\] attached_beyond needs \[mesh.extend\]"),
+        ("[truth]", "[truth]\nattached_beyond = 1.0", "both attached_beyond and attached_rows"),
+        ('files = ["rest.xyz", "pulled_*.xyz"]', "files = []", "needs at least one file"),
+        ('files = ["rest.xyz", "pulled_*.xyz"]', 'files = ["a.npz"]', "key names the array of an .npz"),
+        ('files = ["rest.xyz", "pulled_*.xyz"]', 'files = ["none_*.xyz"]', "no file that matches 'none_"),
+        ('files = ["rest.xyz", "pulled_*.xyz"]', 'files = ["no.xyz"]', r"no\.xyz cannot be read as text"),
+        ('_*.xyz"]', '_*.xyz"]\nrest = 3', r"\[points\] rest is 3; there are 3 frames"),
+        ('_*.xyz"]', '_*.xyz"]\n[frame]\nrotation = [[2,0,0],[0,1,0],[0,0,1]]', "is not a rotation"),
+        ('_*.xyz"]', '_*.xyz"]\n[mesh.extend]\naxis = [0,0,0]', "axis must be a vector that is not zero"),
+        ("[points]", "[points", "is not TOML"),
+    ],
+)
+def test_a_wrong_toml_is_refused_with_key_value_and_what_is_allowed(tmp_path, old, new, message):
+    assert old in TOML
+    where = folder(tmp_path, toml=TOML.replace(old, new))
+    with pytest.raises(RecordingError, match=message) as refusal:
+        bring_in(where)
+    assert "\n" not in str(refusal.value)
+    assert not (where / "run.mcap").exists() and not (where / "run.truth.mcap").exists()
+
+
+def test_a_missing_toml_is_refused(tmp_path):
+    with pytest.raises(RecordingError, match=r"recording\.toml cannot be read"):
+        import_folder(tmp_path, None, tmp_path / "run.mcap")
