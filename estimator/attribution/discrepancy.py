@@ -30,7 +30,7 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
             }
             for one in first.scores
         ],
-        "left_over": [
+        "unexplained_residual": [
             {
                 "gain": one.left.gain,
                 "force_variance": one.left.variance,
@@ -72,7 +72,7 @@ def _effect(closed: Closed, one: Hypothesis, rivals: list[Hypothesis]) -> dict[s
         "log_bayes_factor": one.log_bayes_factor,
         "p_value": one.score.p_value,
         "this_session_alone": one.effect.sensing,
-        "not_told_from": [rival.effect.name for rival in rivals],
+        "indistinguishable_from": [rival.effect.name for rival in rivals],
         "often_confused_with": list(one.effect.confounded_with),
     }
 
@@ -94,7 +94,7 @@ def suggested(found: Suggestion) -> dict[str, Any]:
         "hold_s": found.hold,
         "between": list(found.between),
         "expected_log_bayes_factor": found.expected,
-        "enough": found.enough,
+        "decisive": found.enough,
     }
 
 

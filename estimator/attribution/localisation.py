@@ -14,9 +14,9 @@ def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
     """By frame and by particle, and rank correlations of the distance with what might cause it.
 
     Returns:
-        frames: index, grasp, time [s], rms [m]; particles: rest [m] and mean off, seen less predicted [m], null where
-        never seen, P(attached) and whether that is more than a half; goes_with: Spearman's correlation of |off| over
-        frames and particles with each regressor.
+        frames: index, grasp, time [s], rms [m]; particles: rest [m] and mean residual, seen less predicted [m], null
+        where never seen, P(attached) and whether that is more than a half; rank_correlation: Spearman's correlation of
+        the length of the residual over frames and particles with each regressor.
     """
     frames, rest = list(fitted.equations), np.asarray(problem.history.rest)
     off = np.full((len(frames), len(rest), 3), np.nan)
@@ -40,11 +40,11 @@ def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
         ],
         "particles": {
             "rest_m": rest.tolist(),
-            "mean_off_m": [one.tolist() if known else None for one, known in zip(mean, ever, strict=True)],
+            "mean_residual_m": [one.tolist() if known else None for one, known in zip(mean, ever, strict=True)],
             "p_attached": fitted.probability.tolist(),
             "attached": fitted.attached.tolist(),
         },
-        "goes_with": {
+        "rank_correlation": {
             name: _rank_correlation(distance, values) for name, values in _regressors(problem, fitted, frames).items()
         },
     }
@@ -61,9 +61,9 @@ def _regressors(problem: Problem, fitted: Fitted, frames: list[int]) -> dict[str
     grip = np.stack([rest[one].mean(axis=0) if one.any() else np.full(3, np.nan) for one in held])
     return {
         "height": moved[:, :, 2],
-        "way from rest": np.linalg.norm(moved, axis=2),
-        "step since the frame before": np.linalg.norm(states - before, axis=2),
-        "being let down": (before - states)[:, :, 2],
+        "displacement from rest": np.linalg.norm(moved, axis=2),
+        "step since the previous frame": np.linalg.norm(states - before, axis=2),
+        "lowering": (before - states)[:, :, 2],
         "distance to the grip": np.linalg.norm(rest[None] - grip[:, None], axis=2),
         "time since the jaws closed": np.array([history.frames[k].closed for k in frames])[:, None] * spread,
         "time since the start": np.array([history.frames[k].time for k in frames])[:, None] * spread,

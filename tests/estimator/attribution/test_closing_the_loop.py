@@ -306,7 +306,7 @@ def test_a_hold_that_slips_is_not_explained_by_larger_forces():
     """From the second increment of each lift on, the jaws have gone a centimetre further than what they hold."""
     slipped = [dataclasses.replace(one, tool=_further(one.tool)) if _late(one) else one for one in seen(1.0)]
     _, found, _ = closed_over(slipped)
-    assert found["left_over"][-1]["tool_variance"] > 10, story(found)
+    assert found["unexplained_residual"][-1]["tool_variance"] > 10, story(found)
     assert found["verdict"] in ("unexplained", "effect-with-remainder"), story(found)
 
 
@@ -323,8 +323,8 @@ def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
     closed, found, _ = light
     assert json.loads(json.dumps(found)) == found
     assert {"verdict", "effects", "ambiguous_with", "tested", "held_out", "localisation"} <= set(found)
-    goes_with = found["localisation"]["goes_with"]
-    assert goes_with["height"] is not None and abs(goes_with["height"]) <= 1
+    correlation = found["localisation"]["rank_correlation"]
+    assert correlation["height"] is not None and abs(correlation["height"]) <= 1
     for name in ("a", "b"):
         write_page(tmp_path / f"{name}.html", name="light", sheet=_sheet(closed), found=found)
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
@@ -339,7 +339,7 @@ def test_what_was_found_is_kept_before_a_pull_is_looked_for(light, tmp_path, mon
         raise KeyboardInterrupt
 
     monkeypatch.setattr(keeping.Recording, "open", staticmethod(lambda *_, **__: recording))
-    monkeypatch.setattr(keeping, "gather", lambda *_, **__: dataset)
+    monkeypatch.setattr(keeping, "collect_dataset", lambda *_, **__: dataset)
     monkeypatch.setattr(keeping, "close_the_loop", lambda *_, **__: closed)
     monkeypatch.setattr(keeping, "suggest", stopped)
     with pytest.raises(KeyboardInterrupt):
@@ -362,7 +362,7 @@ def test_a_pull_is_suggested_that_tells_more_than_the_first_lift_did(light):
     assert np.linalg.norm(found.pull) <= max(np.linalg.norm(one.frame.way) for one in dataset.frames) + 1e-9
     assert np.min(np.linalg.norm(sheet().rest - found.grasp, axis=1)) < 1e-3
     told = discrepancy(closed, dataset) | {"suggestion": suggested(found)}
-    assert ("To tell" in " ".join(story(told))) == found.enough
+    assert ("To distinguish" in " ".join(story(told))) == found.enough
 
 
 @pytest.mark.parametrize(
