@@ -28,7 +28,7 @@ from ..metrics.calibration import reliability
 from ..metrics.detection import DILATIONS, GATE_VARIANCE, agreement, distances
 from ..metrics.flat_map import grid_of, outline, plane_of, spacing
 from ..metrics.tracking import tracking
-from ..metrics.truth_transfer import TransferredTruth, carry, frame_at, stiffness_at
+from ..metrics.truth_transfer import TransferredTruth, frame_at, stiffness_at, transfer
 from .pictures import pictures, state_of
 from .verdict import against_truth, doubts, found, stiffness_sums
 
@@ -77,7 +77,7 @@ def write_report(
         raise ValueError("write_report needs at least one Estimate; got none (every frame was skipped?).")
     if images is not None and camera is None:
         raise ValueError("write_report got images without their camera; pass camera=StereoCamera(...).")
-    transferred = None if truth is None else carry(sheet, truth, estimates[-1].index)
+    transferred = None if truth is None else transfer(sheet, truth, estimates[-1].index)
     kept = shown_steps(estimates, sheet.rest)
     pairs = [] if images is None or camera is None else pictures(estimates, images, camera, kept)
     payload = _payload(sheet, estimates, belief, detection, truth, transferred)

@@ -44,7 +44,7 @@ from jiggle_mj.scenes.disturbances.sheet import (
     TissueCreep,
     TissueYield,
 )
-from jiggle_mj.scenes.disturbances.world import BedContact, Friction, Gravity, ViscousDrag
+from jiggle_mj.scenes.disturbances.world import Bed, Friction, Gravity, ViscousDrag
 from jiggle_mj.scenes.scene.attachments import Attachment
 from jiggle_mj.scenes.scene.disturbance import Disturbance
 
@@ -93,7 +93,7 @@ INSIDE: dict[str, PanelRow] = {
     "gravity leaning": _inside(
         "gravity", Gravity(magnitude=1.0, tilt_deg=25, azimuth_deg=30, start=LATE), size=LEANING
     ),
-    "bed lower": _inside("bed", BedContact(magnitude=-0.003, start=LATE), size=(-0.003, 0.0, 0.0)),
+    "bed lower": _inside("bed", Bed(magnitude=-0.003, start=LATE), size=(-0.003, 0.0, 0.0)),
     # no size: contacts creep, and carry 0.25 to 0.53 of their load along the bed by the time a frame is taken
     "friction": _inside("friction", Friction(magnitude=1.0)),
     "viscous drag": _inside("viscous_drag", ViscousDrag(magnitude=2.0), MOVING),

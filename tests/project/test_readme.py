@@ -49,15 +49,15 @@ def blocks(page: str, language: str) -> list[str]:
 
 
 def commands(page: str) -> Iterator[tuple[str, list[str]]]:
-    """Verb and options of each `jiggle-mj VERB ...` in code, fenced or between backquotes."""
+    """Verb and options of each `jiggle-mj VERB ...` in code, fenced or between backquotes; `table` with its name."""
     code = "\n".join(re.findall(r"```.*?```|`[^`\n]+`", page, re.DOTALL))
-    for verb, rest in re.findall(r"\bjiggle-mj ([a-z-]+)([^`#\n]*)", code):
+    for verb, rest in re.findall(r"\bjiggle-mj (table [a-z-]+|[a-z-]+)([^`#\n]*)", code):
         yield verb, re.findall(OPTION, rest)
 
 
 def known_options(verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> set[str]:
     """Those that the verb's own help lists."""
-    monkeypatch.setattr(sys, "argv", ["jiggle-mj", verb, "--help"])
+    monkeypatch.setattr(sys, "argv", ["jiggle-mj", *verb.split(), "--help"])
     with pytest.raises(SystemExit) as stopped:
         cli.main()
     assert stopped.value.code == 0
@@ -117,19 +117,20 @@ def test_every_command_in_the_pages_exists(
 ):
     """Each verb is one of the command line's, and takes the options that stand behind it."""
     for verb, options in commands(path.read_text(encoding="utf-8")):
-        assert verb in cli.VERBS
+        assert verb.split()[0] in cli.VERBS
         assert set(options) <= known_options(verb, monkeypatch, capsys), verb
 
 
 def test_the_readme_shows_every_verb():
-    assert {verb for verb, _ in commands(README)} == set(cli.VERBS)
+    assert {verb.split()[0] for verb, _ in commands(README)} == set(cli.VERBS)
 
 
 def test_every_option_that_readme_and_results_name_exists(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """Also those that are named apart from a command."""
-    known = set().union(*(known_options(verb, monkeypatch, capsys) for verb in cli.VERBS))
+    verbs = {*cli.VERBS, *(verb for page in (README, RESULTS) for verb, _ in commands(page))}
+    known = set().union(*(known_options(verb, monkeypatch, capsys) for verb in sorted(verbs)))
     assert set(re.findall(OPTION, README + RESULTS)) <= known
 
 

@@ -15,11 +15,12 @@ import pytest
 from scipy.spatial import Delaunay
 
 from jiggle_mj.camera import StereoCamera
+from jiggle_mj.episode import Episode
 from jiggle_mj.errors import OutputError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.eval.metrics.flat_map import grid_of, outline, plane_of
-from jiggle_mj.eval.metrics.score import result, with_truth
-from jiggle_mj.eval.metrics.truth_transfer import TransferredTruth, carry
+from jiggle_mj.eval.metrics.score import Run, result, with_truth
+from jiggle_mj.eval.metrics.truth_transfer import TransferredTruth, transfer
 from jiggle_mj.eval.report.pictures import pictures
 from jiggle_mj.eval.report.run_page import write_report
 from jiggle_mj.eval.report.verdict import against_truth, doubts, found, stiffness_sums
@@ -132,18 +133,24 @@ def synthetic() -> dict:
         "belief": Belief(mean=estimates[-1].mean, covariance=np.diag(estimates[-1].sd ** 2)),
         "detection": detection,
     }
-    unscored = result(
-        scene="two lines <synthetic>",
-        seed=0,
-        sensing="stereo",
-        estimator="implicit",
-        policy="corners",
+    episode = Episode(
         sheet=sheet,
-        estimates=estimates,
+        estimates=tuple(estimates),
+        belief=run["belief"],
         detection=detection,
         prior_entropy=420.0,
         n_frames=41,
-        skipped=[(20, "the right image is missing")],
+        skipped=((20, "the right image is missing"),),
+    )
+    unscored = result(
+        Run(
+            scene="two lines <synthetic>",
+            seed=0,
+            sensing="stereo",
+            estimator="implicit",
+            policy="corners",
+            episode=episode,
+        )
     )
     camera = StereoCamera.rectified(
         width=640, height=480, focal=700.0, baseline=0.005, T_world_camera=looking_down(0.16, 35)
@@ -384,9 +391,9 @@ def test_the_page_runs_in_chromium_without_a_console_error(tmp_path, truth, imag
     assert "WebGL is not supported" not in dom
 
 
-def test_the_synthetic_truth_is_carried_over_as_it_was_made():
-    """Guards the fixture: the two lines exist on both meshes, or every picture above would be of nothing."""
+def test_the_synthetic_truth_has_both_lines_on_both_meshes():
+    """Guard the fixture: without the two lines every picture above would show nothing."""
     run = synthetic()
-    transferred = carry(run["sheet"], run["truth"], 36)
+    transferred = transfer(run["sheet"], run["truth"], 36)
     assert 20 < transferred.attached.sum() < 80
     assert 550 < len(run["sheet"].rest) < 750

@@ -17,7 +17,7 @@ from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.planning import information_policy as information
 from jiggle_mj.estimator.planning.information_policy import LOST, InformationPolicy
 from jiggle_mj.estimator.planning.policy import STEP, Policy
-from jiggle_mj.eval.runs.acting import actions, check_goes_with, most_actions, policy_named
+from jiggle_mj.eval.runs.acting import actions, check_policy_fits, most_actions, policy_named
 from jiggle_mj.eval.runs.experiment import run_scene
 from jiggle_mj.limits import Limits
 from jiggle_mj.observation import Declaration
@@ -325,7 +325,7 @@ def test_options_that_do_not_fit_are_refused(scene):
     policy = policy_named("detach", scene, seed=0)
     assert policy is not None
     with pytest.raises(OptionError, match="plan with the filter 'implicit'; got 'adam'"):
-        check_goes_with(policy, replace(EstimatorConfig(), filter="adam"))
+        check_policy_fits(policy, replace(EstimatorConfig(), filter="adam"))
 
 
 def test_every_policy_has_a_length(scene):
