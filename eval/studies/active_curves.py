@@ -11,7 +11,7 @@ from .figures import value
 
 PAGE = "active.html"
 COLOURS = ("#d55e00", "#cc79a7", "#0072b2", "#56b4e9", "#009e73", "#e69f00")
-"""Colours of the policies, told apart with every common colour blindness [Okabe & Ito]."""
+"""Colours of the policies: the palette of Okabe and Ito, for every common colour vision."""
 ROW_HEIGHT = 330
 """Height of a scene's row [px]."""
 

@@ -234,7 +234,7 @@ def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, mo
     assert keys(figures) == KEYS
     assert figures["policy"] == "pmp-up" and figures["ended"] == "all 3 steps are done"
     assert [one["does"][:7] for one in figures["decisions"]] == ["move to"] * 3
-    assert "What it did, and why" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Actions and reasons" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert figures["timing"]["plan_s"] > 0 and figures["safety"]["limit_n"] == 1e-5
     safety = figures["safety"]
     assert safety["force_violations"] > 0 and safety["max_force_n"] > 1e-5
