@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from jiggle_mj.eval.metrics.truth_transfer import carry
+from jiggle_mj.eval.metrics.truth_transfer import transfer
 from jiggle_mj.recording.estimate import read_estimate
 from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
@@ -29,7 +29,7 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 def frames(folder: Path) -> list[np.ndarray]:
     """Left images with particles coloured by P(attached), the true attachments ringed, the grip's way drawn."""
     recording, found = Recording.open(folder / "run.mcap"), read_estimate(folder / "estimate.mcap")
-    truth = carry(found.sheet, read_truth(folder / "run.truth.mcap"), found.estimates[0].index)
+    truth = transfer(found.sheet, read_truth(folder / "run.truth.mcap"), found.estimates[0].index)
     estimates, drawn = {one.index: one for one in found.estimates}, []
     ways: dict[int, list[np.ndarray]] = {}
     camera = recording.camera

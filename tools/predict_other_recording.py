@@ -1,9 +1,9 @@
-"""What a loop found of one recording, held against another of the same sheet: does it foretell that one better?
+"""Test whether the effects found in one recording predict another recording of the same sheet better.
 
     python tools/predict_other_recording.py out/cloth/discrepancy.json other.mcap
 
 Nothing is fitted to the other recording, and nothing is attached in it. Effects that hold for one session alone (of the
-tool, the camera or the tracker) are also left out one by one.
+tool, the camera or the tracker) are also left out one at a time.
 """
 
 import argparse
@@ -26,31 +26,33 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("discrepancy", type=Path)
     parser.add_argument("recording", type=Path)
-    said = parser.parse_args()
-    effects = json.loads(said.discrepancy.read_text())["effects"]
-    recording = Recording.open(said.recording)
+    arguments = parser.parse_args()
+    effects = json.loads(arguments.discrepancy.read_text())["effects"]
+    recording = Recording.open(arguments.recording)
     dataset = collect_dataset(recording.declaration, recording.camera, recording)
     with jax.enable_x64(True):
         problem = Problem.build(dataset, LIBRARY)
-        variants = {"nothing": [], "all of it": effects}
-        for one in effects:
-            if one["this_session_alone"]:
-                variants[f"all but {one['name']}"] = [other for other in effects if other is not one]
-        for name, some in variants.items():
-            print(f"{name}: {_error_by_grasp(problem, some)}", flush=True)
+        variants = {"no effect": [], "all effects": effects}
+        for effect in effects:
+            if effect["this_session_alone"]:
+                variants[f"all but {effect['name']}"] = [kept for kept in effects if kept is not effect]
+        for name, used in variants.items():
+            print(f"{name}: {_error_by_grasp(problem, used)}", flush=True)
 
 
 def _error_by_grasp(problem: Problem, effects: list[dict[str, Any]]) -> str:
+    """Return the held-out error of all frames and of each grasp [mm], as text."""
     frames = problem.history.frames
     theta = np.zeros(problem.sheet.size)
-    for one in effects:
-        theta[problem.sheet.place(one["name"], one["site"])] = one["theta"]
-    states = np.stack([one.state for one in frames])
+    for effect in effects:
+        theta[problem.sheet.place(effect["name"], effect["site"])] = effect["theta"]
+    states = np.stack([frame.state for frame in frames])
     plain = Point(theta=theta, s=np.zeros(states.shape[1]), states=states, seen=states)
     held_out = from_rest(problem, plain, list(range(len(frames))), by_tool=True)
-    grasps = problem.history.by(lambda one: one.grasp, range(len(frames))).values()
-    each = [residuals(problem, held_out, grasp) for grasp in grasps]
-    return f"{1e3 * rms(np.concatenate(each)):.1f} mm; by grasp " + ", ".join(f"{1e3 * rms(one):.1f}" for one in each)
+    grasps = problem.history.by(lambda frame: frame.grasp, range(len(frames))).values()
+    errors = [residuals(problem, held_out, grasp) for grasp in grasps]
+    by_grasp = ", ".join(f"{1e3 * rms(error):.1f}" for error in errors)
+    return f"{1e3 * rms(np.concatenate(errors)):.1f} mm; by grasp {by_grasp}"
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from ..belief.prior import prior_belief
 from ..config import EstimatorConfig
 from ..physics.energy import SheetEnergy
 from ..physics.mesh import SheetMesh
+from ..physics.simulator import simulator
 from ..physics.surrogate import surrogate
 from .adam import RATE, AdamShooting
 from .explicit import PRIOR_MEAN, MultipleShooting
@@ -16,7 +17,6 @@ from .filter import Filter
 from .force_balance import ForceBalance
 from .implicit import ImplicitFilter
 from .nnls import NonNegativeLeastSquares
-from ..physics.simulator import simulator
 from .unscented import ReducedUnscented
 
 FORCE_LEVEL = 0.07

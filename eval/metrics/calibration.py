@@ -1,12 +1,12 @@
-"""Whether the belief's stated uncertainty is honest, against the truth carried to the particles.
+"""Calibration of the belief's uncertainty, against the truth transferred to the particles.
 
-The Gaussian before the non-negativity constraint is judged, since that is what the filter propagates. Particles whose
-true stiffness is no number (a weld, or attached by an unknown amount) are marginalised out, which for a Gaussian means
-dropping their rows and columns; so are those whose variance is not stated (NaN: an estimator without uncertainty).
+The figures are of the Gaussian before the non-negativity constraint, which the filter propagates. Particles whose true
+stiffness is no number (a weld, or attached by an unknown amount) are marginalised out, which for a Gaussian means
+dropping their rows and columns. So are those whose variance is unknown (NaN: an estimator without uncertainty).
 
 NEES is the normalised estimation error squared of Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to
-Tracking and Navigation" (2001); divided by the degrees of freedom it is 1 on average for an honest belief, above 1 for
-an over-confident one.
+Tracking and Navigation" (2001). Divided by the degrees of freedom it is 1 on average for a calibrated belief, and above
+1 for an over-confident one.
 """
 
 from dataclasses import dataclass
@@ -18,46 +18,47 @@ from scipy.special import ndtri
 
 from jiggle_mj.estimate import Belief
 
-LEVEL = 0.90
-"""Probability that the intervals are meant to hold."""
-BINS = 10
+INTERVAL_LEVEL = 0.90
+"""Probability of the credible intervals."""
+N_BINS = 10
 """Equal bins of probability for the expected calibration error."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """None where there is nothing to judge by."""
+    """Calibration figures of one belief; None where nothing defines them."""
 
     nees_per_dof: float | None
+    """NEES per degree of freedom over the particles with a known truth and variance."""
     nees_attached: float | None
-    """The same over the truly attached particles alone: a free one is exactly where a prior may have its peak."""
+    """NEES per degree of freedom over the truly attached particles alone: a free one is where a prior has its peak."""
     coverage_90: float | None
-    """Share of particles whose true stiffness lies in the central 90 % interval of its marginal."""
+    """Share of particles whose true stiffness lies in the central 90 % credible interval of its marginal."""
     coverage_attached: float | None
-    """The same among the truly attached alone: an interval from 0 holds every free one."""
+    """The same share among the truly attached alone: an interval from 0 holds every free one."""
     ece: float | None
     """Expected calibration error of the probabilities of being attached."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bin:
-    """Particles of which about the same probability was said."""
+    """Particles with about the same predicted probability."""
 
     low: float
     high: float
     count: int
-    said: float
-    """Mean of their probabilities."""
+    predicted: float
+    """Mean of the predicted probabilities."""
     attached: float
-    """Share of them that is attached."""
+    """Share of the particles that is attached."""
 
 
 def nees_per_dof(
     belief: Belief, stiffness: Float[np.ndarray, " n"], *, among: Bool[np.ndarray, " n"] | None = None
 ) -> float | None:
-    """(b_hat - b*)^T Sigma^-1 (b_hat - b*) / n over the particles whose b* and variance are finite, in float64.
+    """Return (b_hat - b*)^T Sigma^-1 (b_hat - b*) / n over the particles whose b* and variance are finite, in float64.
 
-    With `among` only over those, the others marginalised out.
+    With `among` only those count, and the others are marginalised out. None where no particle counts.
 
     Raises:
         ValueError: the covariance is not positive definite.
@@ -82,13 +83,14 @@ def nees_per_dof(
 def coverage(
     belief: Belief,
     stiffness: Float[np.ndarray, " n"],
-    level: float = LEVEL,
+    level: float = INTERVAL_LEVEL,
     *,
     among: Bool[np.ndarray, " n"] | None = None,
 ) -> float | None:
-    """Share of particles of finite b* and variance with |b_hat - b*| <= z sd, z the two-sided normal quantile.
+    """Return the share of particles of finite b* and variance with |b_hat - b*| <= z sd.
 
-    Of a belief that states intervals of its own, the share with b* inside; with `among` only over those.
+    z is the two-sided normal quantile of `level`. A belief with intervals of its own is counted by these. With `among`
+    only those particles count.
     """
     if belief.lower is not None and belief.upper is not None:
         known, held = ~np.isnan(stiffness), (belief.lower <= stiffness) & (stiffness <= belief.upper)
@@ -101,23 +103,23 @@ def coverage(
 
 
 def expected_calibration_error(probability: Float[np.ndarray, " n"], attached: Bool[np.ndarray, " n"]) -> float:
-    """Mean over particles of |share attached - mean probability| of the bin that the particle falls into."""
+    """Return the mean over particles of |share attached - mean probability| of the bin that the particle falls into."""
     bins = reliability(probability, attached)
-    return sum(one.count * abs(one.attached - one.said) for one in bins) / len(probability)
+    return sum(each.count * abs(each.attached - each.predicted) for each in bins) / len(probability)
 
 
 def reliability(probability: Float[np.ndarray, " n"], attached: Bool[np.ndarray, " n"]) -> list[Bin]:
-    """What happened where a probability was said, in bins that hold a particle.
+    """Return the share attached by predicted probability, in bins that hold a particle.
 
     A reliability diagram [DeGroot & Fienberg 1983, doi:10.2307/2987588] in numbers.
     """
-    bin_of = np.minimum((probability * BINS).astype(int), BINS - 1)
+    bin_of = np.minimum((probability * N_BINS).astype(int), N_BINS - 1)
     return [
         Bin(
-            low=k / BINS,
-            high=(k + 1) / BINS,
+            low=k / N_BINS,
+            high=(k + 1) / N_BINS,
             count=int(np.sum(bin_of == k)),
-            said=float(probability[bin_of == k].mean()),
+            predicted=float(probability[bin_of == k].mean()),
             attached=float(attached[bin_of == k].mean()),
         )
         for k in np.unique(bin_of)
@@ -131,7 +133,7 @@ def calibration(
     *,
     probability: Float[np.ndarray, " n"] | None = None,
 ) -> Calibration:
-    """All figures; `probability` is that of being attached, None for an estimator that states none."""
+    """Return all figures; `probability` is that of being attached, None for an estimator without one."""
     return Calibration(
         nees_per_dof=nees_per_dof(belief, stiffness),
         nees_attached=nees_per_dof(belief, stiffness, among=attached),

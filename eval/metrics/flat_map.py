@@ -1,6 +1,6 @@
 """The sheet at rest as a map: flat coordinates, a field over its triangles as a grid, and outlines of vertex sets.
 
-For pictures only; no figure is computed from a map.
+Maps are for pictures; no figure is computed from one.
 """
 
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from .detection import edges
 
-LEVEL_COSINE = np.cos(np.radians(30))
-"""A sheet whose normal is within 30 degrees of the vertical is drawn in the world's own x and y."""
-CELLS = 150
+MIN_LEVEL_COSINE = np.cos(np.radians(30))
+"""Smallest vertical part of a level sheet's unit normal: such a sheet is drawn in the world's own x and y."""
+GRID_CELLS = 150
 """Grid cells along a map's longer side."""
 
 
@@ -21,19 +21,22 @@ class Plane:
     """An orthonormal frame in which the sheet is drawn."""
 
     origin: Float[np.ndarray, " 3"]
+    """Origin in the world [m]."""
     axes: Float[np.ndarray, "2 3"]
+    """Unit vectors of the two axes."""
     names: tuple[str, str]
+    """Names of the two axes."""
 
     def flatten(self, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 2"]:
-        """Coordinates in the plane [m]."""
+        """Return coordinates in the plane [m]."""
         return (points - self.origin) @ self.axes.T
 
 
 def plane_of(rest: Float[np.ndarray, "n 3"]) -> Plane:
-    """World x and y for a sheet that lies about level, its two principal axes about its centre otherwise."""
+    """Return world x and y for a sheet that lies about level, its two principal axes about its centre otherwise."""
     centre = rest.mean(axis=0)
     axes = np.linalg.svd(rest - centre, full_matrices=False)[2]
-    if abs(axes[2, 2]) > LEVEL_COSINE:
+    if abs(axes[2, 2]) > MIN_LEVEL_COSINE:
         return Plane(origin=np.zeros(3), axes=np.eye(3)[:2], names=("x", "y"))
     signs = np.sign(axes[np.arange(2), np.abs(axes[:2]).argmax(axis=1)])
     return Plane(origin=centre, axes=axes[:2] * signs[:, None], names=("along", "across"))
@@ -42,12 +45,12 @@ def plane_of(rest: Float[np.ndarray, "n 3"]) -> Plane:
 def grid_of(
     flat: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"], Int[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
-    """Cell centres of a grid over the sheet, and for each the corners and weights of the triangle that covers it.
+    """Return cell centres of a grid over the sheet, and for each the corners and weights of its triangle.
 
-    Weights are NaN outside the sheet; where triangles overlap in the map the last one counts.
+    Weights are NaN outside the sheet. Where triangles overlap in the map the last one counts.
     """
     low, high = flat.min(axis=0), flat.max(axis=0)
-    cell = (high - low).max() / CELLS
+    cell = (high - low).max() / GRID_CELLS
     shape = np.maximum(1, np.ceil((high - low) / cell)).astype(int)
     x, y = (low[k] + cell * (np.arange(shape[k]) + 0.5) for k in range(2))
     corners = np.zeros((len(y), len(x), 3), dtype=int)
@@ -72,7 +75,7 @@ def grid_of(
 def outline(
     flat: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"], chosen: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, "s 2 2"]:
-    """Segments around the chosen vertices, half an edge away from them, closed along the sheet's border."""
+    """Return segments around the chosen vertices, half an edge away from them, closed along the sheet's border."""
     segments = []
     for face in faces[chosen[faces].any(axis=1) & ~chosen[faces].all(axis=1)]:
         inside = chosen[face]
@@ -91,6 +94,6 @@ def outline(
 
 
 def spacing(rest: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> float:
-    """Median edge length: what one ring of dilation means [m]."""
+    """Return the median edge length [m], which is the width of one ring of dilation."""
     pairs = edges(faces)
     return float(np.median(np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1)))

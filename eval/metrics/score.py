@@ -1,93 +1,82 @@
-"""The figures of one run, with the keys of `result.json`, and their file.
+"""The figures of one run, with the keys of `result.json`.
 
-`result` makes the whole skeleton from what the estimator knows, with null for all that needs the truth; `with_truth`
-fills that in; `score` does it for a folder on disk. Fractions, not per cent; null where undefined.
+`result` makes all keys from what the estimator knows, with null for everything that needs the truth. `with_truth` fills
+that in, and `score` does it for a folder on disk. Fractions, not per cent; null where undefined.
 """
 
 import copy
-import json
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool
 
-from jiggle_mj.errors import OutputError, RecordingError
+from jiggle_mj.episode import Episode
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.limits import Limits
-from jiggle_mj.recording.estimate import EstimateRecording, read_estimate
-from jiggle_mj.recording.truth import read_truth
+from jiggle_mj.recording.estimate import EstimateRecording
 from jiggle_mj.truth import Truth
 
 from .calibration import Calibration, calibration
 from .detection import DILATIONS, agreement, average_precision
-from .safety import borne
+from .result_file import Json, read_scorable, write_result
+from .safety import attachment_loads
 from .tracking import tracking
-from .truth_transfer import TransferredTruth, carry
+from .truth_transfer import TransferredTruth, transfer
 
 if TYPE_CHECKING:
     from jiggle_mj.estimator.planning.policy import Decision
 
-Json = dict[str, object]
-RECORDED, IDENTITY = "recording", "recording.identity"
-"""Metadata of an estimate: name and identity of the recording that was estimated."""
 NO_AGREEMENT = {"pcd": None, "pug": None, "f1": None}
 
 
-def result(
-    *,
-    scene: str,
-    seed: int,
-    sensing: str,
-    estimator: str,
-    policy: str,
-    disturbances: str | None = None,
-    sheet: Sheet,
-    estimates: Sequence[Estimate],
-    detection: Detection,
-    prior_entropy: float | None,
-    n_frames: int,
-    skipped: Sequence[tuple[int, str]] = (),
-    simulation_s: float | None = None,
-    limits: Limits | None = None,
-    decisions: Sequence["Decision"] = (),
-    ended: str | None = None,
-    procedure: Json | None = None,
-) -> Json:
-    """All keys of `result.json`, before any truth is seen.
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One run before any truth is seen: what was run, and what came of it."""
 
-    Args:
-        scene: name of the scene or recording.
-        seed: of the run.
-        sensing: stereo, points, particles or cloud.
-        estimator: name of the filter.
-        policy: who chose the pulls.
-        disturbances: as the recording's metadata has them; None where it says nothing.
-        sheet: the estimator's particles.
-        estimates: one for each used frame.
-        detection: what is called attached.
-        prior_entropy: of the belief before any frame [nat]; None if not known.
-        n_frames: of the recording: used, skipped and those with open jaws.
-        skipped: index and reason of each frame that was left out.
-        simulation_s: wall time of the reference tissue, all frames [s]; None for a recording.
-        limits: of what the attachments may bear; None for a recording.
-        decisions: what a policy planned, in order.
-        ended: why a policy planned no more.
-        procedure: of one that cuts or sews, its name and what was seen of each act; see `acting.acts`.
-    """
+    scene: str
+    """Name of the scene or recording."""
+    seed: int
+    """Seed of the run."""
+    sensing: str
+    """Sensing: stereo, points, particles or cloud."""
+    estimator: str
+    """Name of the filter."""
+    policy: str
+    """Name of what chooses the pulls."""
+    episode: Episode
+    """Sheet, estimates, belief and detection."""
+    disturbances: str | None = None
+    """Disturbances, as the recording's metadata has them; None where it has none."""
+    simulation_s: float | None = None
+    """Wall time of the reference tissue over all frames [s]; None for a recording."""
+    limits: Limits | None = None
+    """Limits of the attachment loads; None for a recording."""
+    decisions: Sequence["Decision"] = ()
+    """Actions that a policy planned, in order."""
+    ended: str | None = None
+    """Reason why a policy planned no more."""
+    procedure: Json | None = None
+    """Name of a procedure that cuts or sews, and what was seen of each act; see `acting.acts`."""
+
+
+def result(run: Run) -> Json:
+    """Return all keys of `result.json`, with null for everything that needs the truth."""
+    episode, limits, decisions = run.episode, run.limits, run.decisions
+    estimates, detection = episode.estimates, episode.detection
     update = np.array([estimate.update_s for estimate in estimates])
     perception = np.array([estimate.perception_s for estimate in estimates])
     return {
-        "scene": scene,
-        "seed": seed,
-        "sensing": sensing,
-        "estimator": estimator,
-        "policy": policy,
-        "disturbances": disturbances,
-        "n_particles": len(sheet.rest),
-        "n_frames": n_frames,
+        "scene": run.scene,
+        "seed": run.seed,
+        "sensing": run.sensing,
+        "estimator": run.estimator,
+        "policy": run.policy,
+        "disturbances": run.disturbances,
+        "n_particles": len(episode.sheet.rest),
+        "n_frames": episode.n_frames,
         "detection": {
             "rule": detection.rule,
             "n_detected": int(detection.attached.sum()),
@@ -109,16 +98,18 @@ def result(
             "max_force_n": None,
             "force_violations": None,
         },
-        "decisions": [{"does": one.does, "why": one.why, "plan_s": one.plan_s} for one in decisions],
-        "ended": ended,
-        "procedure": procedure,
+        "decisions": [
+            {"does": decision.does, "why": decision.why, "plan_s": decision.plan_s} for decision in decisions
+        ],
+        "ended": run.ended,
+        "procedure": run.procedure,
         "entropy": {
-            "prior": _number(prior_entropy),
-            "final": _number(estimates[-1].entropy) if estimates else None,
+            "prior": _finite(episode.prior_entropy),
+            "final": _finite(estimates[-1].entropy) if estimates else None,
         },
         "frames": {
             "used": len(estimates),
-            "skipped": [{"index": index, "why": why} for index, why in skipped],
+            "skipped": [{"index": index, "why": why} for index, why in episode.skipped],
             "not_converged": [estimate.index for estimate in estimates if not estimate.converged],
         },
         "timing": {
@@ -127,8 +118,8 @@ def result(
                 "p95": float(np.percentile(update, 95)) if len(update) else None,
             },
             "perception_s": float(np.median(perception)) if len(perception) else None,
-            "plan_s": float(np.median([one.plan_s for one in decisions])) if decisions else None,
-            "simulation_s": _number(simulation_s),
+            "plan_s": float(np.median([decision.plan_s for decision in decisions])) if decisions else None,
+            "simulation_s": _finite(run.simulation_s),
         },
     }
 
@@ -142,10 +133,10 @@ def with_truth(
     detection: Detection,
     truth: Truth,
 ) -> Json:
-    """A copy of `unscored` with all that the truth decides; the truth is that at the last frame the estimator used."""
-    transferred = carry(sheet, truth, estimates[-1].index if estimates else 0)
+    """Return a copy of `unscored` with all figures that need the truth, which is taken at the last used frame."""
+    transferred = transfer(sheet, truth, estimates[-1].index if estimates else 0)
     probability = detection.score if detection.probabilistic else None
-    refined = calibration(belief, transferred.stiffness, transferred.attached, probability=probability)
+    calibrated = calibration(belief, transferred.stiffness, transferred.attached, probability=probability)
     scored = copy.deepcopy(unscored)
     _section(scored, "detection").update(
         n_detected=int(detection.attached.sum()),
@@ -157,42 +148,14 @@ def with_truth(
     if observable is not None:
         _section(scored, "detection").update(
             n_observable=int(observable.sum()),
-            observable={"by_dilation": agreements(sheet, detection.attached, transferred, knowable=observable)},
+            observable={"by_dilation": agreements(sheet, detection.attached, transferred, observable=observable)},
         )
-    _section(scored, "calibration").update(vars(refined))
+    _section(scored, "calibration").update(vars(calibrated))
     _section(scored, "tracking").update(rms_m=tracking(sheet, estimates, truth).rms)
-    _section(scored, "safety").update(_judged(_section(scored, "safety"), truth))
+    _section(scored, "safety").update(_safety(_section(scored, "safety"), truth))
     if scored.get("procedure") is not None:
-        _section(scored, "procedure").update(_succeeded(_section(scored, "procedure"), truth))
+        _section(scored, "procedure").update(_success(_section(scored, "procedure"), truth))
     return scored
-
-
-def read_scorable(directory: Path, truth_path: Path) -> tuple[Json, EstimateRecording, Truth]:
-    """DIR/result.json, DIR/estimate.mcap and the truth, once it is clear that they belong together.
-
-    Raises:
-        OutputError: DIR has no readable `result.json`, or its estimate did not finish.
-        RecordingError: a file is missing, damaged or of the wrong kind, or the truth is of another recording.
-    """
-    unscored = read_result(directory / "result.json")
-    found = read_estimate(directory / "estimate.mcap")
-    if found.belief is None or found.detection is None:
-        raise OutputError(f"{directory / 'estimate.mcap'} ends before its belief; estimate the recording again.")
-    truth = read_truth(truth_path)
-    if found.metadata.get(RECORDED, truth.scene) != truth.scene:
-        raise RecordingError(
-            f"{truth_path} is the truth of '{truth.scene}', and {directory} the estimate of "
-            f"'{found.metadata[RECORDED]}'; give the truth of the same recording."
-        )
-    estimated = found.metadata.get(IDENTITY, "")
-    if truth.identity and estimated and estimated != truth.identity:
-        raise RecordingError(
-            f"{truth_path} is the truth of another recording of '{truth.scene}' than {directory} estimates (another "
-            "scene file, sensing or seed); give the truth that was written with it."
-        )
-    if truth.frames and not {f.index for f in truth.frames} & {e.index for e in found.estimates}:
-        raise RecordingError(f"{truth_path} shares no frame with {directory}; give the truth of the same recording.")
-    return unscored, found, truth
 
 
 def score(directory: Path, truth_path: Path) -> Json:
@@ -204,45 +167,21 @@ def score(directory: Path, truth_path: Path) -> Json:
     return score_read(directory, *read_scorable(directory, truth_path))
 
 
-def score_read(directory: Path, unscored: Json, found: EstimateRecording, truth: Truth) -> Json:
+def score_read(directory: Path, unscored: Json, estimated: EstimateRecording, truth: Truth) -> Json:
     """Score what was read, and write the figures into DIR/result.json.
 
-    All that `result.json` said before and the truth does not decide, above all the timing, is kept.
+    All figures of `result.json` that do not need the truth are kept, above all the timing.
     """
-    assert found.belief is not None and found.detection is not None
+    assert estimated.belief is not None and estimated.detection is not None
     figures = with_truth(
         unscored,
-        sheet=found.sheet,
-        estimates=found.estimates,
-        belief=found.belief,
-        detection=found.detection,
+        sheet=estimated.sheet,
+        estimates=estimated.estimates,
+        belief=estimated.belief,
+        detection=estimated.detection,
         truth=truth,
     )
     write_result(directory / "result.json", figures)
-    return figures
-
-
-def write_result(path: Path, figures: Json) -> None:
-    """Write `result.json`; NaN and infinity are refused, as JSON has neither."""
-    path.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
-
-
-def read_result(path: Path) -> Json:
-    """Read `result.json`.
-
-    Raises:
-        OutputError: the file is missing or is no JSON object.
-    """
-    try:
-        if not path.parent.is_dir():
-            raise OutputError(f"{path.parent} is no folder; give the one that 'estimate' or 'run' filled.")
-        figures = json.loads(path.read_text())
-    except OSError as failure:
-        raise OutputError(f"{path} cannot be read ({failure.strerror}); 'estimate' or 'run' writes it.") from failure
-    except ValueError as failure:
-        raise OutputError(f"{path} is not JSON ({failure}); estimate the recording again.") from failure
-    if not isinstance(figures, dict) or not isinstance(figures.get("detection"), dict):
-        raise OutputError(f"{path} is JSON but not a result of this program; give the folder that 'estimate' wrote.")
     return figures
 
 
@@ -251,21 +190,21 @@ def agreements(
     detected: Bool[np.ndarray, " n"],
     transferred: TransferredTruth,
     *,
-    knowable: Bool[np.ndarray, " n"] | None = None,
+    observable: Bool[np.ndarray, " n"] | None = None,
 ) -> Json:
-    """PCD, PUG and F1 by rings of dilation."""
+    """Return PCD, PUG and F1 by rings of dilation; PUG over the attached particles in `observable`, all if None."""
     by_dilation: Json = {}
     for rings in DILATIONS:
-        one = agreement(detected, transferred.attached, sheet.faces, rings, knowable=knowable)
-        by_dilation[str(rings)] = {"pcd": one.pcd, "pug": one.pug, "f1": one.f1}
+        figures = agreement(detected, transferred.attached, sheet.faces, rings, observable=observable)
+        by_dilation[str(rings)] = {"pcd": figures.pcd, "pug": figures.pug, "f1": figures.f1}
     return by_dilation
 
 
-def _judged(safety: Json, truth: Truth) -> Json:
-    """What the attachments bore at most, and in how many frames it was too much."""
-    loads = borne(truth)
+def _safety(limits: Json, truth: Truth) -> Json:
+    """Return the largest true loads, and the number of frames over each limit."""
+    loads = attachment_loads(truth)
     energy, force = loads.most
-    limit_j, limit_n = safety.get("limit_j"), safety.get("limit_n")
+    limit_j, limit_n = limits.get("limit_j"), limits.get("limit_n")
     return {
         "max_mean_boundary_energy_j": energy,
         "violations": loads.violations(energy=limit_j) if isinstance(limit_j, float) else None,
@@ -274,15 +213,15 @@ def _judged(safety: Json, truth: Truth) -> Json:
     }
 
 
-def _succeeded(procedure: Json, truth: Truth) -> Json:
-    """Whether each act worked, and the procedure: is the tissue free, or its last suture in place?"""
+def _success(procedure: Json, truth: Truth) -> Json:
+    """Say whether each act worked, and the procedure: the tissue is free, or the last suture is in place."""
     done = truth.details.get("events", [])
-    acts = procedure["acts"]
-    assert isinstance(done, list) and isinstance(acts, list)
-    told = [one | {"succeeded": true["succeeded"]} for one, true in zip(acts, done, strict=True)]
+    planned = procedure["acts"]
+    assert isinstance(done, list) and isinstance(planned, list)
+    acts = [act | {"succeeded": event["succeeded"]} for act, event in zip(planned, done, strict=True)]
     if procedure["name"] == "detach":
-        return {"acts": told, "success": not (truth.frames[-1].stiffness != 0).any()}
-    return {"acts": told, "success": bool(told) and told[-1]["succeeded"]}
+        return {"acts": acts, "success": not (truth.frames[-1].stiffness != 0).any()}
+    return {"acts": acts, "success": bool(acts) and acts[-1]["succeeded"]}
 
 
 def _section(figures: Json, name: str) -> Json:
@@ -291,5 +230,5 @@ def _section(figures: Json, name: str) -> Json:
     return section
 
 
-def _number(value: float | None) -> float | None:
+def _finite(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else float(value)

@@ -1,9 +1,7 @@
-"""How far the measured and the believed positions are from the true ones, and what the attachments truly bore.
+"""Errors of the measured and the believed positions against the true ones.
 
-A particle's true position is that of the reference's material point nearest to it at rest (`carrying`), so an error of
-the estimator's rest mesh counts as an error in every frame. The mean boundary energy is over all vertices of the
-reference, attached or not, with anchors at rest: U = 1/n sum_i 1/2 b*_i |x_i - a_i|^2. Welds store no energy that a
-camera could see and are left out.
+A particle's true position is that of the reference's material point nearest to it at rest (`truth_transfer`), so an
+error of the estimator's rest mesh counts as an error in every frame.
 """
 
 from collections.abc import Sequence
@@ -20,19 +18,20 @@ from .truth_transfer import barycentric_weights
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """Root mean square 3-D errors over the particles that were seen [m]; None, NaN in arrays, where none could be."""
+    """Root mean square 3-D errors over the particles that were seen [m]; None, NaN in arrays, where none was seen."""
 
     rms: float | None
-    """Of the measured positions, over all frames."""
+    """Error of the measured positions over all frames."""
     rms_estimate: float | None
-    """Of the believed positions of the same particles."""
+    """Error of the believed positions of the same particles over all frames."""
     per_frame: Float[np.ndarray, " t"]
-    """Of the measured positions."""
+    """Error of the measured positions in each frame."""
     per_frame_estimate: Float[np.ndarray, " t"]
+    """Error of the believed positions in each frame."""
 
 
 def tracking(sheet: Sheet, estimates: Sequence[Estimate], truth: Truth) -> Tracking:
-    """Errors of the particles seen in each frame, against the truth's frame of the same index."""
+    """Return the errors of the particles seen in each frame, against the truth's frame of the same index."""
     frames = {frame.index: frame for frame in truth.frames}
     corners, weights = barycentric_weights(sheet.rest, truth.rest, truth.faces)
     squared, squared_estimate = [], []

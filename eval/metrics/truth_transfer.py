@@ -1,14 +1,14 @@
-"""Carries the truth from the reference's vertices to the estimator's particles, since the two meshes share none.
+"""Transfers the truth from the reference's vertices to the estimator's particles, since the two meshes share none.
 
-Attachment goes by the nearest rest vertex: a particle is truly attached iff its nearest reference vertex is. Stiffness
-goes by virtual work: a vertex's spring pulls at a point of one of the estimator's triangles, whose corners share it,
+Attachment follows the nearest rest vertex: a particle is truly attached iff its nearest reference vertex is. Stiffness
+follows virtual work: a vertex's spring pulls at a point of one of the estimator's triangles, whose corners share it,
 
     b*_particle = sum over vertices of (barycentric weight of the particle at the vertex) b*_vertex,
 
-as consistent nodal loads do in finite elements. So total and centre are kept on any mesh; a particle at the border of a
-patch has a part of what one inside has, and its free neighbour may have the rest.
+as consistent nodal loads do in finite elements. So total and centre are kept on any mesh. A particle at the border of a
+patch has a part of the stiffness of one inside, and its free neighbour may have the rest.
 
-Positions go by barycentric interpolation in the reference's rest triangle nearest to the particle's rest position.
+Positions follow barycentric interpolation in the reference's rest triangle nearest to the particle's rest position.
 """
 
 from dataclasses import dataclass
@@ -23,11 +23,13 @@ from jiggle_mj.truth import Truth, TruthFrame
 
 from .detection import edges
 
-OBSERVABLE = 2.4e-3
-"""Load from which an attachment can be told from the model's own error, four times `EstimatorConfig.force_sd` in the
-shipped scenes [N]."""
+OBSERVABLE_LOAD = 2.4e-3
+"""Load from which an attachment is distinguishable from the model's own error [N].
+
+It is four times `EstimatorConfig.force_sd` in the shipped scenes.
+"""
 PAIRS_AT_ONCE = 400_000
-"""Point-triangle pairs handled together, which bounds the memory to some 100 MB."""
+"""Point-triangle pairs handled together; bounds the memory to about 100 MB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,22 +40,24 @@ class TransferredTruth:
     stiffness: Float[np.ndarray, " n"]
     """b* [N/m]; inf for a weld, NaN where attached by an unknown amount."""
     load: Float[np.ndarray, " n"] | None = None
-    """Root of the sum over frames of the squared force that the attachment carried [N]; None where not recorded."""
+    """Root of the sum over frames of the squared force on the attachment [N]; None where not recorded."""
 
     @property
     def observable(self) -> Bool[np.ndarray, " n"] | None:
-        """Attached particles that were loaded enough to show: at least `OBSERVABLE`; None where not recorded."""
-        return None if self.load is None else self.attached & (self.load >= OBSERVABLE)
+        """Attached particles with a load of at least `OBSERVABLE_LOAD`; None where not recorded."""
+        return None if self.load is None else self.attached & (self.load >= OBSERVABLE_LOAD)
 
 
 def frame_at(truth: Truth, index: int) -> TruthFrame | None:
-    """The truth's last frame whose index is not after `index`; None if there is none."""
+    """Return the truth's last frame whose index is not after `index`; None if there is none."""
     earlier = [frame for frame in truth.frames if frame.index <= index]
     return max(earlier, key=lambda frame: frame.index) if earlier else None
 
 
 def stiffness_at(truth: Truth, frame: TruthFrame | None) -> Float[np.ndarray, " n"]:
-    """True stiffness of the reference's vertices [N/m]: 0 where free, inf welded, NaN attached by an unknown amount.
+    """Return the true stiffness of the reference's vertices [N/m].
+
+    It is 0 where free, inf where welded, and NaN where attached by an unknown amount.
 
     Without a frame only `truth.attached` is known. Cuts and sutures are in the frame: a vertex of stiffness 0 is free
     there even if it was attached at the start.
@@ -63,16 +67,16 @@ def stiffness_at(truth: Truth, frame: TruthFrame | None) -> Float[np.ndarray, " 
     return np.where(np.isnan(frame.stiffness) & ~truth.attached, 0.0, frame.stiffness)
 
 
-def carry(sheet: Sheet, truth: Truth, index: int) -> TransferredTruth:
-    """The truth at observation `index` on the particles of `sheet`, and the loads up to it.
+def transfer(sheet: Sheet, truth: Truth, index: int) -> TransferredTruth:
+    """Return the truth at observation `index` on the particles of `sheet`, and the loads up to it.
 
-    Vertices further from the sheet than its edges are long stand for tissue that it does not have.
+    Vertices further from the sheet than its longest edge belong to tissue that it does not have, and do not count.
     """
     at_vertices = stiffness_at(truth, frame_at(truth, index))
     loads = [frame.load for frame in truth.frames if frame.load is not None and frame.index <= index]
     corners, weights = barycentric_weights(truth.rest, sheet.rest, sheet.faces)
-    foot = np.einsum("vk,vki->vi", weights, sheet.rest[corners])
-    weights[np.linalg.norm(foot - truth.rest, axis=1) > _longest_edge(sheet)] = 0
+    nearest_points = np.einsum("vk,vki->vi", weights, sheet.rest[corners])
+    weights[np.linalg.norm(nearest_points - truth.rest, axis=1) > _longest_edge(sheet)] = 0
 
     def shared(values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
         return np.bincount(corners.ravel(), (weights * values[:, None]).ravel(), minlength=len(sheet.rest))
@@ -87,7 +91,7 @@ def carry(sheet: Sheet, truth: Truth, index: int) -> TransferredTruth:
 
 
 def _longest_edge(sheet: Sheet) -> float:
-    """[m], infinite without triangles."""
+    """Return the longest edge at rest [m]; infinite without triangles."""
     first, second = sheet.rest[edges(sheet.faces)].swapaxes(0, 1)
     return float(np.linalg.norm(first - second, axis=1).max(initial=0)) or np.inf
 
@@ -95,7 +99,7 @@ def _longest_edge(sheet: Sheet) -> float:
 def barycentric_weights(
     points: Float[np.ndarray, "m 3"], vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Int[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-    """Vertices and weights of the point of the mesh that is nearest to each of `points`.
+    """Return vertices and weights of the point of the mesh that is nearest to each of `points`.
 
     Weights are in [0, 1] and sum to 1. A mesh without triangles gives the nearest vertex.
     """

@@ -1,4 +1,4 @@
-"""What closing the loop found, as one page that needs no network: the story in sentences, then its pictures."""
+"""The result of closing the loop as one page that needs no network: sentences first, then pictures."""
 
 from collections.abc import Mapping
 from importlib.resources import files
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
+from jaxtyping import Float
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from plotly.subplots import make_subplots
@@ -16,84 +17,97 @@ from jiggle_mj.estimate import Sheet
 
 from ..metrics.flat_map import plane_of
 
-SHOWN = 12
-"""Effects in the picture of scores."""
+SHOWN_EFFECTS = 12
+"""Most effects in the picture of scores; more names do not fit its height."""
 BEFORE, AFTER, RING = "#d55e00", "#0072b2", "#e8000b"
+"""Colours of the figures before and after, and of the ring around an attached particle."""
+TIMES, LOCALISED = ("before", "after"), ("localisation", "localisation_after")
+"""Keys of discrepancy.json for the two times."""
+PAGE_HEIGHT = 1250
+"""Height of all pictures [px]."""
 VERDICTS = {
-    "no-effect": "Nothing is missing that these frames could show.",
-    "effect": "One cause is named, and it explains what was left.",
-    "ambiguous": "A cause is found, but these frames cannot tell it from others.",
-    "effect-with-remainder": "A cause is named, and something else is left over.",
-    "unexplained": "Something is missing, and no effect of the library explains it.",
+    "no-effect": "These frames show no missing effect.",
+    "effect": "An effect is named, and it explains the residual.",
+    "ambiguous": "An effect is found, but these frames do not distinguish it from others.",
+    "effect-with-remainder": "An effect is named, and a part of the residual stays unexplained.",
+    "unexplained": "There is a residual that no effect of the library explains.",
 }
+"""Sentence for each verdict."""
 
 
 def story(found: Mapping[str, Any]) -> list[str]:
-    """What was found, in sentences."""
-    told = [VERDICTS[found["verdict"]]]
-    for one in found["effects"]:
-        sizes = ", ".join(_size(*each) for each in zip(one["theta"], one["sd"], one["units"], strict=True))
-        told.append(f"Added: {one['name']} ({sizes}), log Bayes factor {one['log_bayes_factor']:.0f}.")
-        if one["this_session_alone"]:
-            told.append(f"{one['name']} is of the tool, camera or tracker, and holds for this session alone.")
-        if one["indistinguishable_from"]:
-            told.append(f"Instead of {one['name']} it may as well be: {', '.join(one['indistinguishable_from'])}.")
-    told += [f"Refused: {one['name']}, since {one['why']}." for one in found["refused"]]
-    held = found["held_out"]
-    if held["folds"] and found["effects"]:
-        before, after = (np.sqrt(np.mean([one[f"{when}_rms_m"] ** 2 for one in held["folds"]])) for when in TIMES)
-        told.append(f"Parts left out of the fit are foretold to {1e3 * before:.2f} mm before, {1e3 * after:.2f} after.")
-    if held["before_rms_m"] is None:
-        told.append(
-            "There is one grasp alone: nothing was held out, and effects that one grasp cannot tell apart stay so."
-        )
-    else:
-        numbers = f"{1e3 * held['before_rms_m']:.2f} mm"
-        if found["effects"]:
-            numbers += f" before, {1e3 * held['after_rms_m']:.2f} mm after"
-        told.append(f"The last part chose no effect; from what the tool says it is foretold to {numbers}.")
-        still, shared = (f"{1e3 * held[f'{name}_rms_m']:.2f} mm" for name in ("unmoved", "in_proportion"))
-        told.append(f"Without a model: {still} if nothing moved, {shared} if each particle went its share of the way.")
+    """Return what was found, in sentences, from the content of discrepancy.json."""
+    sentences = [VERDICTS[found["verdict"]]]
+    for effect in found["effects"]:
+        sizes = ", ".join(_size(*each) for each in zip(effect["theta"], effect["sd"], effect["units"], strict=True))
+        sentences.append(f"Added: {effect['name']} ({sizes}), log Bayes factor {effect['log_bayes_factor']:.0f}.")
+        if effect["this_session_alone"]:
+            sentences.append(
+                f"{effect['name']} belongs to the tool, camera or tracker, and holds for this session alone."
+            )
+        if rivals := effect["indistinguishable_from"]:
+            sentences.append(f"These frames do not distinguish {effect['name']} from: {', '.join(rivals)}.")
+    sentences += [f"Refused: {effect['name']}, because {effect['why']}." for effect in found["refused"]]
+    sentences += _held_out_sentences(found)
     if found["suggestion"] is not None:
-        told.append(_next(found["suggestion"]))
+        sentences.append(_suggestion_sentence(found["suggestion"]))
     if not found["noise"]["still_frames"]:
-        told.append(
+        sentences.append(
             f"There are no still frames: noise of {1e3 * found['noise']['sd_m']:.2g} mm, and as much that neighbours "
             "share, was assumed."
         )
     if left_out := found["frames"]["left_out"]:
-        told.append(
-            f"{len(left_out)} frames of {len(left_out) + found['frames']['used']} are left out: what is held is seen "
-            "there in another shape than when the jaws closed on it, so that they are not followed right."
+        sentences.append(
+            f"{len(left_out)} frames of {len(left_out) + found['frames']['used']} are left out: the held tissue has "
+            "another shape there than when the jaws closed on it, so its tracking is wrong there."
         )
-    return told
+    return sentences
 
 
-def _next(suggestion: Mapping[str, Any]) -> str:
-    grasp, pull = (" ".join(f"{1e3 * one:.0f}" for one in suggestion[key]) for key in ("grasp_m", "pull_m"))
+def _held_out_sentences(found: Mapping[str, Any]) -> list[str]:
+    """Return the errors of held-out parts, and of the part that chose no effect."""
+    held_out, sentences = found["held_out"], []
+    if held_out["folds"] and found["effects"]:
+        before, after = (np.sqrt(np.mean([fold[f"{when}_rms_m"] ** 2 for fold in held_out["folds"]])) for when in TIMES)
+        sentences.append(f"Error of held-out parts: {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after.")
+    if held_out["before_rms_m"] is None:
+        return [
+            *sentences,
+            "There is only one grasp: nothing was held out, and effects that one grasp does not distinguish stay so.",
+        ]
+    numbers = f"{1e3 * held_out['before_rms_m']:.2f} mm"
+    if found["effects"]:
+        numbers += f" before, {1e3 * held_out['after_rms_m']:.2f} mm after"
+    still, shared = (f"{1e3 * held_out[f'{name}_rms_m']:.2f} mm" for name in ("unmoved", "in_proportion"))
+    return [
+        *sentences,
+        f"The last part chose no effect; predicted from the tool's reports alone, its error is {numbers}.",
+        f"Without a model its error is {still} if nothing moves, and {shared} if each particle moves in proportion.",
+    ]
+
+
+def _suggestion_sentence(suggestion: Mapping[str, Any]) -> str:
+    grasp, pull = (" ".join(f"{1e3 * part:.0f}" for part in suggestion[key]) for key in ("grasp_m", "pull_m"))
     between = " and ".join(suggestion["between"])
     expected = f"{suggestion['expected_log_bayes_factor']:.0f} nat"
-    if not suggestion["enough"]:
-        return f"No pull that was tried tells {between} apart: the best is expected to say {expected}."
+    if not suggestion["decisive"]:
+        return f"No pull that was tried distinguishes {between}: the largest expected log Bayes factor is {expected}."
     return (
-        f"To tell {between} apart: grasp at {grasp} mm, pull by {pull} mm, and hold for {suggestion['hold_s']:.0f} s; "
-        f"that is expected to favour the right one by {expected}."
+        f"To distinguish {between}: grasp at {grasp} mm, pull by {pull} mm, and hold for {suggestion['hold_s']:.0f} s; "
+        f"the expected log Bayes factor is {expected}."
     )
 
 
 def _size(value: float, sd: float, unit: str) -> str:
-    """A parameter with its standard deviation, to the digits that it has; lengths and angles in thousandths."""
+    """Return a parameter and its standard deviation as text; lengths and angles in thousandths of their unit."""
     if unit.partition("/")[0] in ("m", "rad"):
         value, sd, unit = 1e3 * value, 1e3 * sd, f"m{unit}"
     digits = max(0, 1 - int(np.floor(np.log10(sd)))) if sd > 0 else 3
     return f"{value:.{digits}f} ± {sd:.{digits}f} {unit}".strip()
 
 
-TIMES, LOCALISED = ("before", "after"), ("localisation", "localisation_after")
-
-
 def write_page(path: Path, *, name: str, sheet: Sheet, found: Mapping[str, Any]) -> None:
-    """Write it; the same input gives the same bytes.
+    """Write the page; the same input gives the same bytes.
 
     Raises:
         OutputError: the file cannot be written.
@@ -121,55 +135,67 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         rows=3,
         cols=2,
         subplot_titles=(
-            "mean miss on the sheet, before [mm]; ringed: found attached",
+            "mean residual on the sheet, before [mm]; ringed: detected attached",
             "after [mm]",
             "log Bayes factor, one step from the fit [nat]",
-            "what the miss goes with (rank correlation), before and after",
-            "miss of each fitted frame [mm]",
-            "parts left out of the fit, then one that chose no effect [mm]",
+            "rank correlation of the residual, before and after",
+            "residual of each fitted frame [mm]",
+            "held-out parts, then the part that chose no effect [mm]",
         ),
         vertical_spacing=0.1,
     )
     flat = plane_of(sheet.rest).flatten(sheet.rest)
-    misses = {
-        when: 1e3
-        * np.array(
-            [np.nan if one is None else np.linalg.norm(one) for one in found[key]["particles"]["mean_residual_m"]]
-        )
-        for when, key in zip(TIMES, LOCALISED, strict=True)
-    }
-    most = float(np.nanmax([np.nanmax(miss) for miss in misses.values()]))
-    for column, (miss, key) in enumerate(zip(misses.values(), LOCALISED, strict=True), 1):
-        marker = {"color": miss, "cmin": 0, "cmax": most, "colorscale": "Viridis", "showscale": column == 2, "size": 9}
+    residuals = [1e3 * _lengths(found[key]["particles"]["mean_residual_m"]) for key in LOCALISED]
+    most = float(np.nanmax([np.nanmax(residual) for residual in residuals]))
+    for column, (residual, key) in enumerate(zip(residuals, LOCALISED, strict=True), 1):
+        marker = {
+            "color": residual,
+            "cmin": 0,
+            "cmax": most,
+            "colorscale": "Viridis",
+            "showscale": column == 2,
+            "size": 9,
+        }
         marker["colorbar"] = {"len": 0.28, "y": 0.87}
-        marker["line"] = {"color": RING, "width": [2.5 if one else 0 for one in found[key]["particles"]["attached"]]}
+        marker["line"] = {
+            "color": RING,
+            "width": [2.5 if attached else 0 for attached in found[key]["particles"]["attached"]],
+        }
         dots = go.Scatter(x=1e3 * flat[:, 0], y=1e3 * flat[:, 1], mode="markers", marker=marker, showlegend=False)
         figure.add_trace(dots, row=1, col=column)
         figure.update_yaxes(scaleanchor=f"x{'' if column == 1 else column}", row=1, col=column)
-    likely = found["scores"][:SHOWN][::-1]
-    bars = go.Bar(x=[one["log_bayes_factor"] for one in likely], y=[one["name"] for one in likely], orientation="h",
-                  marker={"color": BEFORE}, showlegend=False)  # fmt: skip
+    likely = found["scores"][:SHOWN_EFFECTS][::-1]
+    bars = go.Bar(x=[score["log_bayes_factor"] for score in likely], y=[score["name"] for score in likely],
+                  orientation="h", marker={"color": BEFORE}, showlegend=False)  # fmt: skip
     figure.add_trace(bars, row=2, col=1)
     for when, key, colour in zip(TIMES, LOCALISED, (BEFORE, AFTER), strict=True):
-        goes = {name: value for name, value in found[key]["correlates_with"].items() if value is not None}
-        figure.add_trace(
-            go.Bar(x=[*goes.values()], y=[*goes], orientation="h", marker={"color": colour}, name=when), row=2, col=2
-        )
+        known = {name: value for name, value in found[key]["rank_correlation"].items() if value is not None}
+        bars = go.Bar(x=[*known.values()], y=[*known], orientation="h", marker={"color": colour}, name=when)
+        figure.add_trace(bars, row=2, col=2)
         frames = found[key]["frames"]
-        misses_mm = [None if one["rms_m"] is None else 1e3 * one["rms_m"] for one in frames]
-        line = go.Scatter(x=[one["index"] for one in frames], y=misses_mm, mode="lines+markers", name=when,
+        line = go.Scatter(x=[frame["index"] for frame in frames], y=[_in_mm(frame["rms_m"]) for frame in frames],
+                          mode="lines+markers", name=when,
                           marker={"color": colour}, showlegend=False)  # fmt: skip
         figure.add_trace(line, row=3, col=1)
-        held = [one[f"{when}_rms_m"] for one in found["held_out"]["folds"]] + [found["held_out"][f"{when}_rms_m"]]
-        labels = [f"left out {k + 1}" for k in range(len(held) - 1)] + ["chose no effect"]
-        bars = go.Bar(x=labels, y=[None if one is None else 1e3 * one for one in held], marker={"color": colour},
-                      name=when, showlegend=False)  # fmt: skip
+        errors = [fold[f"{when}_rms_m"] for fold in found["held_out"]["folds"]] + [found["held_out"][f"{when}_rms_m"]]
+        labels = [f"held out {k + 1}" for k in range(len(errors) - 1)] + ["chose no effect"]
+        bars = go.Bar(x=labels, y=[_in_mm(error) for error in errors], marker={"color": colour}, name=when,
+                      showlegend=False)  # fmt: skip
         figure.add_trace(bars, row=3, col=2)
     figure.update_layout(
         legend={"orientation": "h", "x": 0.62, "y": 0.685, "traceorder": "normal"},
-        height=1250,
+        height=PAGE_HEIGHT,
         template="plotly_white",
         barmode="group",
         margin={"l": 40, "r": 20},
     )
     return figure
+
+
+def _in_mm(error: float | None) -> float | None:
+    return None if error is None else 1e3 * error
+
+
+def _lengths(vectors: list[list[float] | None]) -> Float[np.ndarray, " n"]:
+    """Return the length of each vector; NaN where there is none."""
+    return np.array([np.nan if vector is None else np.linalg.norm(vector) for vector in vectors])

@@ -1,9 +1,9 @@
 """Writes a run as one HTML page that needs no network: verdict, maps, pictures, the moving sheet, curves, settings.
 
-The page holds plotly.js, its own script and all numbers, and forbids itself every connection. It shows what it is
-given: without truth nothing is scored, without images there are no pictures. The same input gives the same bytes.
+The page holds plotly.js, its own script and all numbers, and its policy forbids every connection. Without truth nothing
+is scored, and without images there are no pictures. The same input gives the same bytes.
 
-Numbers are rounded for the page (0.01 mm, four digits); the figures proper are in `result.json`.
+Numbers are rounded for the page (0.01 mm, four digits); the exact figures are in `result.json`.
 """
 
 import json
@@ -28,17 +28,20 @@ from ..metrics.calibration import reliability
 from ..metrics.detection import DILATIONS, GATE_VARIANCE, agreement, distances
 from ..metrics.flat_map import grid_of, outline, plane_of, spacing
 from ..metrics.tracking import tracking
-from ..metrics.truth_transfer import TransferredTruth, carry, frame_at, stiffness_at
+from ..metrics.truth_transfer import TransferredTruth, frame_at, stiffness_at, transfer
 from .pictures import pictures, state_of
 from .verdict import against_truth, doubts, found, stiffness_sums
 
 MAX_STEPS = 60
-"""Frames on the slider."""
+"""Most frames on the slider."""
 MAX_PARTICLE_STEPS = 120_000
-"""Particles times frames on the slider, for each of estimate and truth: about 4 MB of numbers."""
-MOST_DRAWN = 9.0
-"""Stiffnesses above are drawn like it [reference of the belief]."""
+"""Most particles times frames on the slider, for each of estimate and truth: about 4 MB of numbers."""
+MAX_COLOUR_SHARE = 9.0
+"""Largest stiffness on the colour scale [reference of the belief]; stiffer particles get its colour."""
+OPENING_SHARE = 0.9
+"""Share of the largest displacement that the frame at which the page opens has at least."""
 UNDEFINED = "\N{EN DASH}"
+"""Text of a figure that is not defined."""
 
 
 def write_report(
@@ -57,17 +60,17 @@ def write_report(
     """Write the page.
 
     Args:
-        path: of the HTML file.
+        path: the HTML file.
         sheet: the estimator's particles.
-        estimates: one for each used frame, in order; those read back from a file carry no wall times, and no curve
-            of them is drawn then.
-        belief: at the end.
-        detection: what is called attached.
+        estimates: one for each used frame, in order. Those read from a file have no wall times, and no curve of the
+            times is drawn then.
+        belief: the belief at the end.
+        detection: the particles that are reported attached.
         result: as in `result.json`, scored if there is truth.
-        settings: settings and versions, nested as they come; printed as a table.
+        settings: settings and versions, nested at will; printed as a table.
         truth: None for real data.
-        images: the raw stereo pair of an observation's index; None where there is none.
-        camera: that took the images; needed with them.
+        images: gives the raw stereo pair of an observation's index, or None.
+        camera: the camera that took the images; needed with them.
 
     Raises:
         OutputError: the file cannot be written.
@@ -77,7 +80,7 @@ def write_report(
         raise ValueError("write_report needs at least one Estimate; got none (every frame was skipped?).")
     if images is not None and camera is None:
         raise ValueError("write_report got images without their camera; pass camera=StereoCamera(...).")
-    transferred = None if truth is None else carry(sheet, truth, estimates[-1].index)
+    transferred = None if truth is None else transfer(sheet, truth, estimates[-1].index)
     kept = shown_steps(estimates, sheet.rest)
     pairs = [] if images is None or camera is None else pictures(estimates, images, camera, kept)
     payload = _payload(sheet, estimates, belief, detection, truth, transferred)
@@ -97,10 +100,10 @@ def write_report(
     here = files(__package__) / "templates"
     page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     page.filters.update(number=_text, percent=_percent, milli=_milli)
-    beside = None
+    comparison = None
     sentences = [found(sheet, detection, plane_of(sheet.rest))]
     if truth is not None and transferred is not None:
-        beside = _beside(sheet, estimates, belief, detection, truth, transferred)
+        comparison = _comparison(sheet, estimates, belief, detection, truth, transferred)
         sentences += [
             against_truth(sheet, detection, transferred),
             stiffness_sums(sheet, belief, detection, transferred),
@@ -109,7 +112,7 @@ def write_report(
     text = page.from_string((here / "report.html").read_text("utf-8")).render(
         result=result,
         sentences=sentences,
-        beside=beside,
+        comparison=comparison,
         ring_mm=spacing(sheet.rest, sheet.faces) * 1e3,
         gate_variance=GATE_VARIANCE,
         has_pictures=bool(pairs),
@@ -139,7 +142,7 @@ def _payload(
     plane, last = plane_of(sheet.rest), estimates[-1]
     flat = plane.flatten(sheet.rest) * 1e3
     true_b = None if truth is None else stiffness_at(truth, frame_at(truth, last.index))
-    most = math.inf if belief.reference is None else MOST_DRAWN * belief.reference
+    most = math.inf if belief.reference is None else MAX_COLOUR_SHARE * belief.reference
     finite = [] if transferred is None else transferred.stiffness[np.isfinite(transferred.stiffness)].tolist()
     top = max([min(float(detection.stiffness.max()), most), *finite]) or 1.0
     x, y, corners, weights = grid_of(flat, sheet.faces)
@@ -209,13 +212,13 @@ def _series(sheet: Sheet, estimates: Sequence[Estimate], truth: Truth | None) ->
     if truth is not None:
         errors = tracking(sheet, estimates, truth)
         series["measured_mm"] = _significant(errors.per_frame * 1e3)
-        series["believed_mm"] = _significant(errors.per_frame_estimate * 1e3)
+        series["estimated_mm"] = _significant(errors.per_frame_estimate * 1e3)
     return series
 
 
 def _truth_steps(truth: Truth, estimates: Sequence[Estimate], kept: Sequence[int], top: float) -> list[object]:
-    frames, room = {frame.index: frame for frame in truth.frames}, MAX_PARTICLE_STEPS // max(1, len(truth.rest))
-    every = math.ceil(len(kept) / max(1, room))
+    frames, most = {frame.index: frame for frame in truth.frames}, MAX_PARTICLE_STEPS // max(1, len(truth.rest))
+    every = math.ceil(len(kept) / max(1, most))
     steps: list[object] = []
     for place, step in enumerate(kept):
         frame = frames.get(estimates[step].index)
@@ -228,7 +231,7 @@ def _truth_steps(truth: Truth, estimates: Sequence[Estimate], kept: Sequence[int
     return steps
 
 
-def _beside(
+def _comparison(
     sheet: Sheet,
     estimates: Sequence[Estimate],
     belief: Belief,
@@ -236,25 +239,25 @@ def _beside(
     truth: Truth,
     transferred: TransferredTruth,
 ) -> dict[str, object]:
-    """Figures that `result.json` has no key for."""
+    """Return the figures against the truth that `result.json` has no key for."""
     certain = detection.stiffness_sd**2 <= GATE_VARIANCE
     true_b = stiffness_at(truth, frame_at(truth, estimates[-1].index))
-    places, held_at = sheet.rest[detection.attached], truth.rest[~(true_b == 0)]
+    detected, attached = sheet.rest[detection.attached], truth.rest[~(true_b == 0)]
     return {
         "gated": {
             str(rings): agreement(detection.attached, transferred.attached, sheet.faces, rings, certain=certain)
             for rings in DILATIONS
         },
         "uncertain": int((~certain).sum()),
-        "to_truth": distances(places, held_at),
-        "to_detection": distances(held_at, places),
+        "to_truth": distances(detected, attached),
+        "to_detection": distances(attached, detected),
         "reliability": reliability(detection.score, transferred.attached) if detection.probabilistic else [],
         "rms_estimate": tracking(sheet, estimates, truth).rms_estimate,
     }
 
 
 def _grasps(estimates: Sequence[Estimate]) -> list[dict[str, int]]:
-    """Runs of frames, by position, in which one set of particles is held."""
+    """Return the runs of frames, by position, in which one set of particles is held."""
     runs: list[dict[str, int]] = []
     for step, estimate in enumerate(estimates):
         if not estimate.held.any():
@@ -268,23 +271,23 @@ def _grasps(estimates: Sequence[Estimate]) -> list[dict[str, int]]:
 
 
 def _paths(estimates: Sequence[Estimate]) -> list[np.ndarray]:
-    """Where the middle of what is held went in each grasp [m]."""
+    """Return the path of the centre of the held particles in each grasp [m]."""
     return [
-        np.array([one.positions[one.held].mean(axis=0) for one in estimates[grasp["first"] : grasp["last"] + 1]])
+        np.array([e.positions[e.held].mean(axis=0) for e in estimates[grasp["first"] : grasp["last"] + 1]])
         for grasp in _grasps(estimates)
     ]
 
 
 def shown_steps(estimates: Sequence[Estimate], rest: np.ndarray) -> list[int]:
-    """Positions in `estimates` of the frames on the slider, thinned evenly."""
+    """Return the positions in `estimates` of the frames on the slider, thinned evenly."""
     count = min(len(estimates), MAX_STEPS, max(2, MAX_PARTICLE_STEPS // len(rest)))
     return np.unique(np.linspace(0, len(estimates) - 1, count).round().astype(int)).tolist()
 
 
 def _opening(estimates: Sequence[Estimate], kept: Sequence[int], rest: np.ndarray) -> int:
-    """The place on the slider that the page opens at: the last frame that is lifted about as far as any."""
+    """Return the place on the slider at which the page opens: the last frame that is lifted about as far as any."""
     motion = np.array([np.abs(estimates[step].positions - rest).max() for step in kept])
-    return int(np.flatnonzero(motion >= 0.9 * motion.max())[-1])
+    return int(np.flatnonzero(motion >= OPENING_SHARE * motion.max())[-1])
 
 
 def _rows(settings: Mapping[str, object], prefix: str = "") -> list[tuple[str, str]]:

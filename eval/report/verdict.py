@@ -1,4 +1,4 @@
-"""What was found, in one or two sentences for people."""
+"""Sentences of a report: what was found, how it compares with the truth, and why to doubt it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,21 +11,21 @@ from ..metrics.detection import dilate, patches
 from ..metrics.flat_map import Plane
 from ..metrics.truth_transfer import TransferredTruth
 
-POOR_FIT = 1.5
-"""A noise that is wider by more than this is worth a word."""
-NAMED_PATCHES = 3
-"""Patches whose place is spelled out; the others are counted."""
+MAX_SD_RATIO = 1.5
+"""Largest ratio of the found to the assumed standard deviation of a noise that is no doubt yet."""
+LISTED_PATCHES = 3
+"""Patches whose place is given; the others are counted."""
 
 
 def found(sheet: Sheet, detection: Detection, plane: Plane) -> str:
-    """How many particles are reported attached, in which patches, where, and how stiff."""
+    """Return how many particles are reported attached, in which patches, where, and how stiff."""
     groups = patches(detection.attached, sheet.faces)
     total = int(detection.attached.sum())
     if not groups:
         return "No particle is reported attached."
     flat, (first, second) = plane.flatten(sheet.rest) * 1e3, plane.names
     places = []
-    for group in groups[:NAMED_PATCHES]:
+    for group in groups[:LISTED_PATCHES]:
         x, y = flat[group].mean(axis=0)
         places.append(f"{len(group)} around {first} = {_integer(x)} mm, {second} = {_integer(y)} mm")
     rest = len(groups) - len(places)
@@ -37,7 +37,7 @@ def found(sheet: Sheet, detection: Detection, plane: Plane) -> str:
 
 
 def against_truth(sheet: Sheet, detection: Detection, transferred: TransferredTruth) -> str:
-    """How many of the reported are right, and how many of the attached were found, exactly and within one ring."""
+    """Return how many reports are right, and how many of the attached were found, exactly and within one ring."""
     detected, attached = detection.attached, transferred.attached
     n_detected, n_attached = int(detected.sum()), int(attached.sum())
     if not n_attached:
@@ -54,26 +54,28 @@ def against_truth(sheet: Sheet, detection: Detection, transferred: TransferredTr
 
 
 def stiffness_sums(sheet: Sheet, belief: Belief, detection: Detection, transferred: TransferredTruth) -> str:
-    """Over the attached particles and one ring around them: the estimated sum of b, its deviation, and the true one."""
+    """Return the estimated sum of b, its standard deviation and the true sum, over the attached and one ring around."""
     if not transferred.attached.any() or not np.isfinite(transferred.stiffness).all():
         return ""
     near = dilate(transferred.attached, sheet.faces, 1)
     sd = belief.deviation_of_sum(detection.stiffness, near)
-    stated = f"a stated standard deviation of {sd:.1f}" if np.isfinite(sd) else "no stated deviation"
+    deviation = f"a standard deviation of {sd:.1f}" if np.isfinite(sd) else "no standard deviation"
     total, true = detection.stiffness[near].sum(), transferred.stiffness[near].sum()
-    return f"Over these and one ring around them b sums to {total:.1f} N/m, with {stated}; the truth is {true:.1f}."
+    return f"Over these and one ring around them b sums to {total:.1f} N/m, with {deviation}; the truth is {true:.1f}."
 
 
 def doubts(figures: Mapping[str, Any]) -> list[str]:
-    """Why to trust what was found less, from `result.json`; of a version that did not say, nothing."""
-    said = []
+    """Return reasons to doubt what was found, from `result.json`; none from a version that did not write them."""
+    sentences = []
     if not figures["detection"].get("converged", True):
-        said.append("Two halves of the samples disagree: more of them would give other probabilities.")
+        sentences.append("Two halves of the samples disagree: more samples would give other probabilities.")
     noise = figures.get("noise", {})
     for name, what in (("force_sd_ratio", "The model's forces"), ("position_sd_ratio", "The positions")):
-        if (ratio := noise.get(name)) is not None and ratio > POOR_FIT:
-            said.append(f"{what} are off by {ratio:.1f} times what was stated, and were trusted that much less.")
-    return said
+        if (ratio := noise.get(name)) is not None and ratio > MAX_SD_RATIO:
+            sentences.append(
+                f"{what} are off by {ratio:.1f} times the assumed standard deviation, and got that much less weight."
+            )
+    return sentences
 
 
 def _integer(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Which actions a run takes: the scene's own programme, or those of a policy that looks at the estimate."""
+"""The actions of a run: the scene's own programme, or those of a policy that looks at the estimate."""
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -15,22 +15,24 @@ from jiggle_mj.estimator.planning.procedures import Detach, ProcedurePolicy, Sew
 from jiggle_mj.estimator.planning.tool_kinematics import ToolKinematics
 from jiggle_mj.options import POLICIES, PRIMITIVES
 
-from ..metrics.score import Json
+from ..metrics.result_file import Json
 
 if TYPE_CHECKING:
     from jiggle_mj.scenes import Scene
 
-STEPS, LONG = 40, 400
-"""Most actions of a policy, and of one that cuts or sews, if nothing else is said."""
+MAX_STEPS = 40
+"""Most actions of a policy if no number is given."""
+MAX_PROCEDURE_STEPS = 400
+"""Most actions of a policy that cuts or sews: it looks again after each act."""
 
 
 def policy_named(name: str | None, scene: "Scene", *, seed: int) -> Policy | None:
-    """A fresh policy; None for the scene's programme.
+    """Return a fresh policy; None for the scene's programme.
 
     Args:
         name: one of `POLICIES`; None for the scene's own.
-        scene: its limits are kept.
-        seed: draws what the policy draws.
+        scene: gives the limits and the jaws.
+        seed: of the policy's samples.
 
     Raises:
         OptionError: no such policy.
@@ -44,15 +46,15 @@ def policy_named(name: str | None, scene: "Scene", *, seed: int) -> Policy | Non
         return PAPER[name](limits, seed=seed)
     if name in PRIMITIVES:
         return Primitive(name.removeprefix("pmp-"))
-    look = partial(InformationPolicy, limits, radius=scene.tweezer.radius, seed=seed, tweezer=_tweezer())
+    information = partial(InformationPolicy, limits, radius=scene.tweezer.radius, seed=seed, tweezer=_tweezer())
     if name == "information":
-        return look()
+        return information()
     if name == "one-grasp":
-        return look(regrasps=False)
+        return information(regrasps=False)
     if name == "detach":
-        return Detach(look)
+        return Detach(information)
     plan = scene.procedure
-    return Sew(look, length=plan.suture_length, width=plan.suture_width, stiffness=plan.suture_stiffness)
+    return Sew(information, length=plan.suture_length, width=plan.suture_width, stiffness=plan.suture_stiffness)
 
 
 @cache
@@ -62,8 +64,8 @@ def _tweezer() -> ToolKinematics:
     return ToolKinematics.read(TWEEZER.read_text(encoding="utf-8"))
 
 
-def check_goes_with(policy: Policy, config: EstimatorConfig) -> None:
-    """Check that a policy can read the belief.
+def check_policy_fits(policy: Policy, config: EstimatorConfig) -> None:
+    """Check that a policy can read the belief of the filter.
 
     Raises:
         OptionError: it predicts pulls, and the filter is not the one that can.
@@ -71,7 +73,7 @@ def check_goes_with(policy: Policy, config: EstimatorConfig) -> None:
     if isinstance(policy, InformationPolicy | ProcedurePolicy) and config.filter != "implicit":
         raise OptionError(
             f"information, one-grasp, detach and suture plan with the filter 'implicit'; got {config.filter!r}. "
-            "Leave --estimator out, or choose a policy of the paper's."
+            "Leave --estimator out, or choose a policy of the paper."
         )
 
 
@@ -83,46 +85,55 @@ def actions(
     *,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Action]:
-    """What the tool does, in order, until `stop` says so: who does not choose its grasps is given the scene's first."""
+    """Yield what the tool does, in order, until `stop` is true.
+
+    A policy that does not choose its grasps gets the scene's first grasp.
+    """
     from jiggle_mj.scenes.scene.programme import programme
 
-    first = programme(scene) if policy is None else _beginning(scene, policy)
+    first = programme(scene) if policy is None else _opening(scene, policy)
     first = takewhile(lambda _: not stop(), first)
-    return first if policy is None else chain(first, policy.actions(estimator, steps=_most(policy, steps), stop=stop))
+    if policy is None:
+        return first
+    return chain(first, policy.actions(estimator, steps=_max_steps(policy, steps), stop=stop))
 
 
 def acts(policy: Policy | None, estimator: Estimator) -> Json | None:
-    """The procedure's part of result.json: each cut or suture with the evidence that it worked; None if it is none."""
+    """Return the procedure's part of result.json: each cut or suture with the log Bayes factor that it worked.
+
+    Returns:
+        None where the policy is no procedure.
+    """
     if not isinstance(policy, ProcedurePolicy):
         return None
     seen: list[object] = [
         {
-            "frame": one.index,
-            "kind": type(one.event).__name__.lower(),
-            "log_bayes_factor": estimator.change_log_bayes_factor(one),
+            "frame": change.index,
+            "kind": type(change.event).__name__.lower(),
+            "log_bayes_factor": estimator.change_log_bayes_factor(change),
         }
-        for one in estimator.changes
+        for change in estimator.changes
     ]
     return {"name": policy.name, "cycles": len(seen), "success": None, "acts": seen}
 
 
 def most_actions(scene: "Scene", name: str | None, steps: int | None = None) -> int:
-    """How many there are at most, for progress."""
+    """Return the largest number of actions of a run, for progress."""
     from jiggle_mj.scenes.scene.programme import programme
 
     policy = policy_named(name, scene, seed=0)
     if policy is None:
         return sum(1 for _ in programme(scene))
-    return _most(policy, steps) + sum(1 for _ in _beginning(scene, policy))
+    return _max_steps(policy, steps) + sum(1 for _ in _opening(scene, policy))
 
 
-def _most(policy: Policy, steps: int | None) -> int:
+def _max_steps(policy: Policy, steps: int | None) -> int:
     if steps is not None and steps < 1:
         raise OptionError(f"steps = {steps}: must be at least 1.")
-    return steps or (LONG if isinstance(policy, ProcedurePolicy) else STEPS)
+    return steps or (MAX_PROCEDURE_STEPS if isinstance(policy, ProcedurePolicy) else MAX_STEPS)
 
 
-def _beginning(scene: "Scene", policy: Policy) -> Iterator[Action]:
+def _opening(scene: "Scene", policy: Policy) -> Iterator[Action]:
     from jiggle_mj.scenes.scene.programme import opening, still
 
     if isinstance(policy, InformationPolicy):

@@ -1,7 +1,7 @@
 """Closes the loop over a recording: files in, `discrepancy.json` and a page of pictures out.
 
-The truth, where one is given, is opened when all is decided and kept, and only adds what was found of the attachments
-before and after.
+A truth file, if given, is opened after everything is decided and written. It only adds the detection figures before and
+after.
 """
 
 import json
@@ -28,8 +28,9 @@ from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.truth import Truth
 
-from ..metrics.score import Json, agreements
-from ..metrics.truth_transfer import carry
+from ..metrics.result_file import Json
+from ..metrics.score import agreements
+from ..metrics.truth_transfer import transfer
 from ..report.discrepancy_page import write_page
 
 DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
@@ -44,21 +45,21 @@ def close_loop(
     suggestion: bool = False,
     overwrite: bool = False,
     allow_truncated: bool = False,
-    on_frame: OnFrame = lambda observation, found: None,
+    on_frame: OnFrame = lambda observation, estimate: None,
     log: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Find what the model lacks of a recording, add it, and report the error before and after.
+    """Find the effects that the model lacks for a recording, add them, and report the error before and after.
 
     Args:
         recording_path: the MCAP file.
         directory: where discrepancy.json and discrepancy.html go.
-        truth: a truth file, to score what is found attached before and after; looked at when all is decided.
-        library: effects that are looked for; `(*LIBRARY, mine)` adds one.
-        suggestion: look for the pull that best tells apart what these frames cannot.
+        truth: a truth file, to score the detected attachments before and after; opened after everything is decided.
+        library: effects that are tested; `(*LIBRARY, mine)` adds one.
+        suggestion: search the pull that best distinguishes the effects that these frames do not.
         overwrite: replace an earlier run's files.
-        allow_truncated: use what is whole of a recording that was cut off.
+        allow_truncated: use the complete part of a recording that was cut off.
         on_frame: called after each frame of the first estimate.
-        log: told what is being done.
+        log: gets a line for each step of the work.
 
     Returns:
         The content of discrepancy.json.
@@ -79,29 +80,29 @@ def close_loop(
         found = made_by() | discrepancy(closed, dataset)
     sheet, name = dataset.estimator.sheet, recording.metadata.get("name", recording_path.stem)
 
-    def keep() -> None:
+    def write() -> None:
         (directory / DISCREPANCY).write_text(json.dumps(found, indent=1) + "\n")
         write_page(directory / PAGE, name=name, sheet=sheet, found=found)
 
-    keep()
+    write()
     if truth is not None:
-        true = read_truth(truth)
-        if true.identity != recording.metadata.get("identity", ""):
-            raise RecordingError(f"{truth} is not the truth of {recording_path}.")
+        opened = read_truth(truth)
+        if opened.identity != recording.metadata.get("identity", ""):
+            raise RecordingError(f"{truth} is not the truth of {recording_path}; give the one written with it.")
         last = dataset.frames[-1].index
         for when, fitted in (("before", closed.contexts[0].fitted), ("after", closed.final)):
-            found[f"detection_{when}"] = _scored(sheet, fitted.attached, true, last)
-        keep()
+            found[f"detection_{when}"] = _detection(sheet, fitted.attached, opened, last)
+        write()
     if suggestion:
         with jax.enable_x64(True), one_thread():
             best = suggest(closed, dataset, log=log)
         found["suggestion"] = None if best is None else suggested(best)
-        keep()
+        write()
     return found
 
 
-def _scored(sheet: Sheet, detected: Bool[np.ndarray, " n"], truth: Truth, index: int) -> Json:
-    transferred = carry(sheet, truth, index)
+def _detection(sheet: Sheet, detected: Bool[np.ndarray, " n"], truth: Truth, index: int) -> Json:
+    transferred = transfer(sheet, truth, index)
     return {
         "n_detected": int(detected.sum()),
         "n_attached": int(transferred.attached.sum()),

@@ -1,11 +1,11 @@
-"""The two whole jobs: a scene from the tissue to the report, and a recording from its file to the report.
+"""The two complete jobs: a scene from the tissue to the report, and a recording from its file to the report.
 
-Each fills a folder with the files of an experiment. The truth, where there is any, is opened only after the estimate is
+Each fills a folder with the files of an experiment. The truth, if there is one, is opened only after the estimate is
 written.
 """
 
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -30,23 +30,24 @@ from jiggle_mj.episode import (
 from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import Disparity, TissueMask
-from jiggle_mj.estimator.planning.policy import INTERRUPTED, Decision, Policy
-from jiggle_mj.limits import Limits
+from jiggle_mj.estimator.planning.policy import INTERRUPTED, Policy
 from jiggle_mj.observation import StereoPair
 from jiggle_mj.recording.estimate import EstimateRecording, read_estimate
 from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.recording.reader import Recording
 from jiggle_mj.truth import Truth
 
-from ..metrics.score import IDENTITY, RECORDED, Json, read_scorable, result, score_read, write_result
+from ..metrics.result_file import IDENTITY, RECORDED, Json, read_scorable, write_result
+from ..metrics.score import Run, result, score_read
 from ..report.run_page import shown_steps, write_report
-from .acting import actions, acts, check_goes_with, policy_named
+from .acting import actions, acts, check_policy_fits, policy_named
 
 if TYPE_CHECKING:
     from jiggle_mj.options import Sensing
     from jiggle_mj.scenes import Scene
 
-PACKAGES = ("jiggle-mj", "mujoco", "jax", "numpy", "scipy", "opencv-python-headless")
+REPORTED_PACKAGES = ("jiggle-mj", "mujoco", "jax", "numpy", "scipy", "opencv-python-headless")
+"""Packages whose versions are in the report: those that can change a figure."""
 
 
 def run_scene(
@@ -56,6 +57,7 @@ def run_scene(
     seed: int = 0,
     sensing: "Sensing" = "stereo",
     policy: str | None = None,
+    planner: Policy | None = None,
     steps: int | None = None,
     config: EstimatorConfig | None = None,
     mask: TissueMask | None = None,
@@ -64,21 +66,22 @@ def run_scene(
     on_frame: OnFrame | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Json:
-    """The main job: reference tissue, observations, estimate, score, report.
+    """Run the main job: reference tissue, observations, estimate, score, report.
 
     Args:
         scene: the tissue, the grasp programme and the limits of a policy.
         directory: where the files go.
         seed: of the sensing noise; the same seed gives the same recording.
         sensing: what the estimator sees.
-        policy: who chooses the pulls, one of `POLICIES`; the scene's own if None.
-        steps: how many actions a policy may take at most; the programme takes its own.
+        policy: name of what chooses the pulls, one of `POLICIES`; the scene's own if None.
+        planner: plans in place of the policy of that name.
+        steps: most actions of a policy; the programme has its own number.
         config: of the estimator.
         mask: see `Estimator`.
         disparity: see `Estimator`.
         overwrite: replace an earlier run's files.
         on_frame: called after each frame.
-        stop: asked before each action; once it says so the run ends, and what was seen is judged and written.
+        stop: asked before each action; once it is true the run ends, and what was seen is scored and written.
 
     Returns:
         The content of result.json.
@@ -89,31 +92,35 @@ def run_scene(
     from jiggle_mj.scenes import Reference  # here, so that a recording can be estimated without MuJoCo
 
     policy = policy or scene.programme.policy
-    chooses, config = policy_named(policy, scene, seed=seed), config or EstimatorConfig()
-    if chooses is not None:
+    planner, config = planner or policy_named(policy, scene, seed=seed), config or EstimatorConfig()
+    if planner is not None:
         config = replace(config, refinement="frames")
-        check_goes_with(chooses, config)
+        check_policy_fits(planner, config)
     own = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
     check_directory(directory, own, overwrite=overwrite)
     watch = Stopwatch()
     with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference:
         estimator = Estimator(reference.declaration, reference.camera, config=config, mask=mask, disparity=disparity)
         clear_directory(directory, own)
-        said = "" if chooses is None else f"{policy}, {steps} steps, {settings(estimator.config)}"
-        about = {RECORDED: scene.name, IDENTITY: recording_identity(scene, sensing, seed, said)}
-        does = actions(scene, chooses, estimator, steps, stop=stop)
-        refused = None if chooses is None else chooses.refused
+        description = "" if planner is None else f"{policy}, {steps} steps, {settings(estimator.config)}"
+        about = {RECORDED: scene.name, IDENTITY: recording_identity(scene, sensing, seed, description)}
         frames = observe(
-            reference, does, directory / RECORDING, seed=seed, policy=said, watch=watch, on_refused=refused
+            reference,
+            actions(scene, planner, estimator, steps, stop=stop),
+            directory / RECORDING,
+            seed=seed,
+            policy=description,
+            watch=watch,
+            on_refused=None if planner is None else planner.refused,
         )
         try:
             episode = estimate(frames, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
         except PerceptionError as failure:
-            if chooses is None or any(isinstance(one.action, Grasp) for one in chooses.decisions):
+            if planner is None or any(isinstance(decision.action, Grasp) for decision in planner.decisions):
                 raise
-            raise PerceptionError(f"the policy {policy} has ended, as {chooses.ended}: {failure}") from failure
-    unscored = _result(
-        episode,
+            raise PerceptionError(f"the policy {policy} has ended, as {planner.ended}: {failure}") from failure
+    run = Run(
+        episode=episode,
         scene=scene.name,
         seed=seed,
         sensing=sensing,
@@ -122,13 +129,13 @@ def run_scene(
         disturbances=reference.metadata.get("disturbances"),
         simulation_s=watch.seconds,
         limits=scene.limits.limits(),
-        decisions=[] if chooses is None else chooses.decisions,
-        ended=_ended(chooses, interrupted=stop()),
-        procedure=acts(chooses, estimator),
+        decisions=() if planner is None else tuple(planner.decisions),
+        ended=_ended(planner, interrupted=stop()),
+        procedure=acts(planner, estimator),
     )
-    write_result(directory / RESULT, unscored)
-    unscored, found, truth = read_scorable(directory, truth_path(directory / RECORDING))
-    scored = score_read(directory, unscored, found, truth)
+    write_result(directory / RESULT, result(run))
+    unscored, estimated, truth = read_scorable(directory, truth_path(directory / RECORDING))
+    scored = score_read(directory, unscored, estimated, truth)
     _report(directory, episode, scored, recording=directory / RECORDING, truth=truth)
     return scored
 
@@ -144,7 +151,7 @@ def run_estimator(
     allow_truncated: bool = False,
     on_frame: OnFrame | None = None,
 ) -> Json:
-    """Estimate from a recording: observations only.
+    """Estimate from a recording, which holds observations only, and write the report.
 
     Args:
         recording_path: the MCAP file.
@@ -153,7 +160,7 @@ def run_estimator(
         mask: see `Estimator`.
         disparity: see `Estimator`.
         overwrite: replace an earlier run's files.
-        allow_truncated: use what is whole of a recording that was cut off.
+        allow_truncated: use the complete part of a recording that was cut off.
         on_frame: called after each frame.
 
     Returns:
@@ -170,8 +177,8 @@ def run_estimator(
     name = recording.metadata.get("name", recording_path.stem)
     about = {RECORDED: name, IDENTITY: recording.metadata.get("identity", "")}
     episode = estimate(recording, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
-    figures = _result(
-        episode,
+    run = Run(
+        episode=episode,
         scene=name,
         seed=int(recording.metadata.get("seed", 0)),
         sensing=recording.metadata.get("sensing", "points" if recording.camera is None else "stereo"),
@@ -179,6 +186,7 @@ def run_estimator(
         policy="recorded",
         disturbances=recording.metadata.get("disturbances"),
     )
+    figures = result(run)
     write_result(directory / RESULT, figures)
     _report(directory, episode, figures, recording=recording_path)
     return figures
@@ -187,42 +195,42 @@ def run_estimator(
 def score_directory(
     directory: Path, truth: Path, *, recording: Path | None = None, log: Callable[[str], None] = lambda _: None
 ) -> Json:
-    """Score an estimate that lies in a folder, and write its report anew with the truth beside it.
+    """Score an estimate in a folder, and write its report again with the truth.
 
     Args:
         directory: the folder.
         truth: the truth file.
-        recording: what was estimated, for the report's pictures; if None, it is looked for beside the truth file and in
+        recording: what was estimated, for the report's pictures; if None, it is searched next to the truth file and in
             the folder.
-        log: told if the report loses its pictures.
+        log: gets a line if the report loses its pictures.
 
     Raises:
         RecordingError: the folder holds no estimate, the file no truth, or one of another recording.
         OutputError: the estimate did not finish.
     """
-    unscored, found, true = read_scorable(directory, truth)
-    if recording is not None and not _is_of(found, recording):
-        raise RecordingError(f"{recording} is not the recording that {directory} estimates.")
-    figures = score_read(directory, unscored, found, true)
+    unscored, estimated, opened = read_scorable(directory, truth)
+    if recording is not None and not _is_of(estimated, recording):
+        raise RecordingError(f"{recording} is not the recording that {directory} estimates; give that one, or none.")
+    figures = score_read(directory, unscored, estimated, opened)
     if recording is None:
-        beside = truth.with_name(truth.name.replace(".truth.", "."))
-        candidates = (path for path in (beside, directory / RECORDING) if path != truth and path.exists())
-        recording = next((path for path in candidates if _is_of(found, path)), None)
+        sibling = truth.with_name(truth.name.replace(".truth.", "."))
+        candidates = (path for path in (sibling, directory / RECORDING) if path != truth and path.exists())
+        recording = next((path for path in candidates if _is_of(estimated, path)), None)
     if recording is None and figures["sensing"] == "stereo":
-        log("the recording is not beside the truth: the report has no pictures; pass --recording for them")
-    _report(directory, found, figures, recording=recording, truth=true)
+        log("the recording is not next to the truth: the report has no pictures; pass --recording for them")
+    _report(directory, estimated, figures, recording=recording, truth=opened)
     return figures
 
 
 def _ended(policy: Policy | None, *, interrupted: bool) -> str | None:
-    """Why a policy has ended; of the scene's programme, only that it did not get to its end."""
+    """Return why a policy has ended; for the scene's programme, only that it was interrupted."""
     if policy is None:
         return INTERRUPTED if interrupted else None
     return policy.ended
 
 
 def _is_of(read: EstimateRecording, recording: Path) -> bool:
-    """Whether an estimate is of this recording, by name and identity."""
+    """Say whether an estimate is of this recording, by name and identity."""
     about = Recording.open(recording, allow_truncated=True).metadata
     same = about.get("name", recording.stem) == read.metadata.get(RECORDED)
     return same and about.get("identity", "") == read.metadata.get(IDENTITY, "")
@@ -230,70 +238,35 @@ def _is_of(read: EstimateRecording, recording: Path) -> bool:
 
 def _report(
     directory: Path,
-    found: Episode | EstimateRecording,
+    estimated: Episode | EstimateRecording,
     figures: Json,
     *,
     recording: Path | None,
     truth: Truth | None = None,
 ) -> None:
     """Write report.html; the pictures come from the recording, if there is one with images."""
-    if found.belief is None or found.detection is None:
+    if estimated.belief is None or estimated.detection is None:
         raise OutputError(f"{directory / ESTIMATE} ends before its belief; estimate the recording again.")
     opened = None if recording is None else Recording.open(recording, allow_truncated=True)
     settings: dict[str, object] = {"estimate": dict(read_estimate(directory / ESTIMATE).metadata)}
     if opened is not None:
         declared = asdict(opened.declaration)
         settings["declared"] = {key: value for key, value in declared.items() if key != "mesh"}
-    settings["versions"] = {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+    settings["versions"] = {name: version(name) for name in REPORTED_PACKAGES} | {"python": platform.python_version()}
     pairs: dict[int, StereoPair] = {}
     if opened is not None and opened.camera is not None:
-        shown = {found.estimates[step].index for step in shown_steps(found.estimates, found.sheet.rest)}
+        steps = shown_steps(estimated.estimates, estimated.sheet.rest)
+        shown = {estimated.estimates[step].index for step in steps}
         pairs = {frame.index: frame.images for frame in opened if frame.index in shown and frame.images is not None}
     write_report(
         directory / REPORT,
-        sheet=found.sheet,
-        estimates=found.estimates,
-        belief=found.belief,
-        detection=found.detection,
+        sheet=estimated.sheet,
+        estimates=estimated.estimates,
+        belief=estimated.belief,
+        detection=estimated.detection,
         result=figures,
         settings=settings,
         truth=truth,
         images=pairs.get if pairs else None,
         camera=None if opened is None else opened.camera,
-    )
-
-
-def _result(
-    episode: Episode,
-    *,
-    scene: str,
-    seed: int,
-    sensing: str,
-    estimator: str,
-    policy: str,
-    disturbances: str | None,
-    simulation_s: float | None = None,
-    limits: Limits | None = None,
-    decisions: Sequence[Decision] = (),
-    ended: str | None = None,
-    procedure: Json | None = None,
-) -> Json:
-    return result(
-        scene=scene,
-        seed=seed,
-        sensing=sensing,
-        estimator=estimator,
-        policy=policy,
-        disturbances=disturbances,
-        sheet=episode.sheet,
-        estimates=episode.estimates,
-        detection=episode.detection,
-        prior_entropy=episode.prior_entropy,
-        n_frames=episode.n_frames,
-        skipped=episode.skipped,
-        simulation_s=simulation_s,
-        limits=limits,
-        decisions=decisions,
-        ended=ended,
-        procedure=procedure,
     )

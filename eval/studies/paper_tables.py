@@ -1,15 +1,15 @@
 """The paper's two tables of simulated estimation, printed figures beside measured ones.
 
-Table 1 (`simulation`): four corner grasps. Appendix (`one-lift`): the first of them. Five shapes, each method against
-three references: the two engines of `same_engine`, and MuJoCo's vertices with noise, by `run_scene`. The Gaussian
-methods share the prior and the paper's rule, attached above half of b*; ours states P(attached), and knows no b*. Each
-run has a folder, and is not repeated.
+Table 1 (`simulation`) lifts four corners in turn. The appendix (`one-lift`) lifts the first of them. Each of five
+shapes meets each method and three references: the two engines of `same_engine`, and MuJoCo's vertices with noise, by
+`run_scene`. The Gaussian methods share the prior and the paper's rule: attached above half of b*. Ours reports
+P(attached), and knows no b*.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from jiggle_mj.episode import ESTIMATE, RESULT, check_directory, clear_directory, estimate
 from jiggle_mj.estimator import Estimator, EstimatorConfig
@@ -18,19 +18,22 @@ from jiggle_mj.estimator.physics.simulator import HINGE_STIFFNESS, SWEEPS_PER_ST
 from jiggle_mj.scenes import Scene, load_scene
 from jiggle_mj.scenes.scene.programme import grasp_points
 
-from ..metrics.score import Json, result, with_truth, write_result
+from ..metrics.result_file import Json, read_result, write_result
+from ..metrics.score import Run, result, with_truth
 from ..runs.experiment import run_scene
-from .main_table import cell, finished, value
-from .same_engine import HEIGHT, INCREMENTS, NOISE, STIFFNESS, Engine, same_engine
+from .figures import Columns, figure_cells, is_scored
+from .same_engine import LIFT_INCREMENTS, LIFT_SHARE, POINT_SD, STIFFNESS_SHARE, Engine, same_engine
+from .study import Study, Table
 
 Reference = Literal["xpbd", "equilibrium", "mujoco"]
 REFERENCES: tuple[Reference, ...] = ("xpbd", "equilibrium", "mujoco")
-RULE = 0.5
-"""b_thresh / b*, as in the paper (0.05 / 0.1)."""
-OWN_FORCE_SD = 5e-4
-"""Force that the model gets wrong, as our filter is told where the truth is its own equilibrium [k x spacing].
+THRESHOLD_SHARE = 0.5
+"""Threshold of the detection rule as a share of b*, b_thresh / b*, as in the paper (0.05 / 0.1)."""
+EXACT_FORCE_SD = 5e-4
+"""Standard deviation of the model's force error where the truth is our filter's own equilibrium [k x spacing].
 
-The others are not told: least squares take it for the noise of the positions too, the unscented filter for a tolerance.
+Only our filter gets it. Least squares take this number for the noise of the positions too, the unscented filter for a
+tolerance.
 """
 METHODS = {
     "explicit (the paper's filter)": EstimatorConfig(filter="explicit"),
@@ -39,9 +42,9 @@ METHODS = {
     "unscented, patches": EstimatorConfig(filter="unscented"),
     "implicit (ours)": EstimatorConfig(),
 }
-"""Name and settings of each row."""
+"""Name and settings of each method."""
 SCENES = ("arc", "line", "line_dot", "arc_line", "u_shape")
-FIGURES = (
+FIGURES: Columns = (
     ("PCD %", ("detection", "by_dilation", "0", "pcd"), 100.0, 0),
     ("PUG %", ("detection", "by_dilation", "0", "pug"), 100.0, 0),
     ("PCD % one ring", ("detection", "by_dilation", "1", "pcd"), 100.0, 0),
@@ -51,19 +54,21 @@ FIGURES = (
     ("ECE", ("calibration", "ece"), 1.0, 3),
     ("update s", ("timing", "update_s", "median"), 1.0, 2),
 )
+"""Heading, place in result.json, factor and digits of each measured column."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaperTable:
-    """One table of the paper."""
+class PrintedTable:
+    """One table as the paper prints it."""
 
     grasps: int
+    """Corners that are lifted, one after the other."""
     printed: dict[str, dict[str, tuple[float | None, float]]]
     """PCD and PUG in per cent, by method and scene; None where the paper prints a slash."""
 
 
 TABLES = {
-    "simulation": PaperTable(
+    "simulation": PrintedTable(
         grasps=4,
         printed={
             "Ours": {"arc": (100, 87.1), "line": (100, 43.3), "line_dot": (96.0, 48.9), "arc_line": (97.3, 65.5),
@@ -72,7 +77,7 @@ TABLES = {
                      "u_shape": (87.3, 52.9)},
         },
     ),
-    "one-lift": PaperTable(
+    "one-lift": PrintedTable(
         grasps=1,
         printed={
             "Ours": {"arc": (100, 14.8), "line": (100, 16.7), "line_dot": (100, 5.1), "arc_line": (100, 16.4),
@@ -88,7 +93,7 @@ TABLES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
+class PaperRow:
     """One line of a measured table: a scene, a reference and a method over all seeds."""
 
     scene: str
@@ -97,88 +102,120 @@ class Cell:
 
     @property
     def config(self) -> EstimatorConfig:
-        """The method's settings with the paper's rule for this b*; ours with its own engine's model error."""
-        found = replace(METHODS[self.method], detect_above=RULE * true_share(self))
-        exact = self.reference == "equilibrium" and found.filter == "implicit"
-        return replace(found, force_sd=OWN_FORCE_SD) if exact else found
+        """The method's settings, with the paper's rule for this b*, and our filter's force error where it is exact."""
+        config = replace(METHODS[self.method], detect_above=THRESHOLD_SHARE * true_share(self))
+        exact = self.reference == "equilibrium" and config.filter == "implicit"
+        return replace(config, force_sd=EXACT_FORCE_SD) if exact else config
 
 
-def true_share(cell: Cell) -> float:
-    """b* of an attached particle [membrane stiffness]."""
-    if cell.reference != "mujoco":
-        return STIFFNESS
-    scene = load_scene(cell.scene)
+@dataclass(frozen=True, kw_only=True)
+class PaperCell:
+    """One run of a measured table."""
+
+    row: PaperRow
+    seed: int
+
+
+def true_share(row: PaperRow) -> float:
+    """Return b* of an attached particle as a share of the membrane stiffness."""
+    if row.reference != "mujoco":
+        return STIFFNESS_SHARE
+    scene = load_scene(row.scene)
     return scene.attachments[0].stiffness / scene.declared.membrane_stiffness
 
 
-def cells() -> tuple[Cell, ...]:
-    """All lines, those of one reference together."""
-    return tuple(
-        Cell(scene=scene, reference=reference, method=method)
-        for reference in REFERENCES
-        for scene in SCENES
-        for method in METHODS
-    )
+ROWS = tuple(
+    PaperRow(scene=scene, reference=reference, method=method)
+    for reference in REFERENCES
+    for scene in SCENES
+    for method in METHODS
+)
+"""All lines, those of one reference together."""
 
 
-def measure(
-    table: PaperTable, cells: Iterable[Cell], seeds: Iterable[int], directory: Path, *, log: Callable[[str], None]
-) -> dict[Cell, list[Json]]:
-    """Run what has not been run, and read all results.
+@dataclass(frozen=True, kw_only=True)
+class PaperStudy(Study[PaperCell, Json]):
+    """One of the paper's tables, measured."""
 
-    Args:
-        table: says how many corners are lifted.
-        cells: lines of the table.
-        seeds: of the noise, for each line.
-        directory: holds a folder for each run.
-        log: told of each run before it starts.
-    """
-    seeds, found = tuple(seeds), {}
-    for one in cells:
-        found[one] = []
-        for seed in seeds:
-            name = f"{table.grasps}-{one.scene}-{one.reference}-{one.config.filter}-{seed}"
-            done = finished(directory / name, one.config)
-            if done is None:
-                log(f"{one.scene}, {one.reference}, {one.method}, seed {seed}")
-                done = run(one, table.grasps, seed, directory / name)
-            found[one].append(done)
-    return found
+    default_seeds: ClassVar[range] = range(10)
+    table: PrintedTable
+    rows: tuple[PaperRow, ...] = ROWS
+    load_scene: Callable[[str], Scene] = load_scene
+    """Gives the scene of a row's name."""
 
+    def cells(self, seeds: Iterable[int]) -> tuple[PaperCell, ...]:
+        """Return every row with every seed."""
+        seeds = tuple(seeds)
+        return tuple(PaperCell(row=row, seed=seed) for row in self.rows for seed in seeds)
 
-def run(cell: Cell, grasps: int, seed: int, directory: Path) -> Json:
-    """One run, replacing what is in its folder; the content of result.json."""
-    scene = load_scene(cell.scene)
-    if cell.reference != "mujoco":
-        return run_same_engine(scene, cell.reference, directory, seed=seed, grasps=grasps, config=cell.config)
-    scene = replace(scene, programme=replace(scene.programme, points=grasp_points(scene)[:grasps]))
-    return run_scene(scene, directory, seed=seed, sensing="particles", config=cell.config, overwrite=True)
+    def name(self, cell: PaperCell) -> str:
+        """Return the run's folder name."""
+        row = cell.row
+        return f"{self.table.grasps}-{row.scene}-{row.reference}-{row.config.filter}-{cell.seed}"
+
+    def run_cell(self, cell: PaperCell, path: Path) -> None:
+        """Run the scene on the cell's reference into its folder."""
+        row, grasps = cell.row, self.table.grasps
+        scene, config = self.load_scene(row.scene), row.config
+        if row.reference != "mujoco":
+            run_same_engine(scene, row.reference, path, seed=cell.seed, grasps=grasps, config=config)
+        else:
+            scene = replace(scene, programme=replace(scene.programme, points=grasp_points(scene)[:grasps]))
+            run_scene(scene, path, seed=cell.seed, sensing="particles", config=config, overwrite=True)
+
+    def is_current(self, cell: PaperCell, path: Path) -> bool:
+        """Say whether the folder holds a scored run of this version with the method's settings."""
+        return is_scored(path, cell.row.config)
+
+    def read(self, cell: PaperCell, path: Path) -> Json:
+        """Read result.json."""
+        return read_result(path / RESULT)
+
+    def summarise(self, results: Mapping[PaperCell, Json]) -> Table:
+        """Return the printed figures, then a line for each scene, reference and method; the settings beneath."""
+        headings = [heading for heading, *_ in FIGURES]
+        rows = []
+        for method, by_scene in self.table.printed.items():
+            for scene, (pcd, pug) in by_scene.items():
+                shares = ["/" if share is None else f"{share:g}" for share in (pcd, pug)]
+                unknown = ["" for _ in headings[2:]]
+                rows.append((scene, "its own engine", f"{method}, printed", *shares, *unknown))
+        measured: dict[PaperRow, list[Json]] = {}
+        for cell, figures in results.items():
+            measured.setdefault(cell.row, []).append(figures)
+        for row, runs in measured.items():
+            rows.append((row.scene, row.reference, row.method, *figure_cells(runs, FIGURES)))
+        seeds = sorted({str(figures["seed"]) for figures in results.values()}, key=int)
+        return Table(
+            headings=("scene", "reference", "method", *headings),
+            rows=tuple(rows),
+            beneath=("", *settings_in_words(self.table, seeds)),
+        )
 
 
 def run_same_engine(
     scene: Scene, engine: Engine, directory: Path, *, seed: int, grasps: int, config: EstimatorConfig
-) -> Json:
-    """Truth by `same_engine`, estimate through the front door, score; estimate.mcap and result.json."""
+) -> None:
+    """Make a truth by `same_engine`, estimate it as any recording is, and write estimate.mcap and scored result.json.
+
+    Args:
+        scene: whose sheet and shapes.
+        engine: what computes the truth.
+        directory: the run's folder; files that are there are replaced.
+        seed: of the noise.
+        grasps: corners that are lifted.
+        config: of the estimator.
+    """
     check_directory(directory, (), overwrite=True)
     clear_directory(directory, (ESTIMATE, RESULT))
     made = same_engine(scene, engine, seed=seed, grasps=grasps)
     estimator = Estimator(made.declaration, config=config)
     episode = estimate(made.observations, estimator, directory / ESTIMATE)
-    unscored = result(
-        scene=scene.name,
-        seed=seed,
-        sensing="particles",
-        estimator=config.filter,
-        policy="corners",
-        sheet=episode.sheet,
-        estimates=episode.estimates,
-        detection=episode.detection,
-        prior_entropy=episode.prior_entropy,
-        n_frames=episode.n_frames,
-        skipped=episode.skipped,
+    run = Run(
+        scene=scene.name, seed=seed, sensing="particles", estimator=config.filter, policy="corners", episode=episode
     )
     scored = with_truth(
-        unscored,
+        result(run),
         sheet=episode.sheet,
         estimates=episode.estimates,
         belief=episode.belief,
@@ -186,43 +223,25 @@ def run_same_engine(
         truth=made.truth,
     )
     write_result(directory / RESULT, scored)
-    return scored
 
 
-def markdown(table: PaperTable, results: dict[Cell, list[Json]]) -> str:
-    """Printed figures first, then one line for each scene, reference and method; the settings beneath."""
-    headings = [name for name, *_ in FIGURES]
-    lines = ["| scene | reference | method | " + " | ".join(headings) + " |", "|" + "---|" * (len(headings) + 3)]
-    for method, by_scene in table.printed.items():
-        for scene, (pcd, pug) in by_scene.items():
-            shares = ["/" if share is None else f"{share:g}" for share in (pcd, pug)]
-            rest = ["" for _ in headings[2:]]
-            lines.append("| " + " | ".join([scene, "its own engine", f"{method}, printed", *shares, *rest]) + " |")
-    for one, runs in results.items():
-        figures = [cell([value(run, path) for run in runs], factor, digits) for _, path, factor, digits in FIGURES]
-        lines.append("| " + " | ".join([one.scene, one.reference, one.method, *figures]) + " |")
-    seeds = sorted({str(run["seed"]) for runs in results.values() for run in runs}, key=int)
-    return "\n".join([*lines, "", settings_in_words(table, seeds)])
-
-
-def settings_in_words(table: PaperTable, seeds: list[str]) -> str:
-    """What the table was made with."""
+def settings_in_words(table: PrintedTable, seeds: list[str]) -> tuple[str, ...]:
+    """Return lines that say what the table was made with."""
     common = EstimatorConfig()
-    shipped = {true_share(Cell(scene=scene, reference="mujoco", method="implicit (ours)")) for scene in SCENES}
-    return "\n".join(
-        (
-            f"Mean (lowest…highest) over the seeds {', '.join(seeds)}, which draw the noise of {NOISE * 1e3:g} mm.",
-            f"Corners lifted: {table.grasps}. k: membrane stiffness.",
-            f"xpbd, equilibrium: the scene's mesh, b* = {STIFFNESS:g} k,",
-            f"lifts of {HEIGHT:g} of the width in {INCREMENTS} moves, each from rest.",
-            f"mujoco: the scene as shipped, b* = {' or '.join(f'{share:.3g}' for share in sorted(shipped))} k.",
-            f"Attached: above {RULE:g} b*. Prior sd {common.prior_sd:.3g} k, force sd {common.force_sd:g} k x spacing,",
-            f"but {OWN_FORCE_SD:g} for ours where the truth is an equilibrium of the same energy,",
-            f"{common.samples} sample a frame. f: dt = {TIME_STEP:g} s, {SWEEPS_PER_STEP} sweeps,",
-            f"hinges {HINGE_STIFFNESS:.3g} k. Adam: rate {adam.RATE:g} k, {adam.ADAM_STEPS} steps a frame.",
-            f"{unscented.PATCHES} patches. Ours: attached where P > 0.5, with P / (1 - P) beforehand of",
-            f"{common.prior.probability / (1 - common.prior.probability):.3g} times e^{common.prior.coupling:g}",
-            f"for each attached neighbour, and b / (b + k) from {common.prior.components[0]:g} up where attached.",
-            "Printed: one run each, b* = 0.1, b_thresh = 0.05, no units, no noise.",
-        )
+    shipped = {true_share(PaperRow(scene=scene, reference="mujoco", method="implicit (ours)")) for scene in SCENES}
+    return (
+        f"Mean (lowest…highest) over the seeds {', '.join(seeds)}, which draw the noise of {POINT_SD * 1e3:g} mm.",
+        f"Corners lifted: {table.grasps}. k: membrane stiffness.",
+        f"xpbd, equilibrium: the scene's mesh, b* = {STIFFNESS_SHARE:g} k,",
+        f"lifts of {LIFT_SHARE:g} of the width in {LIFT_INCREMENTS} moves, each from rest.",
+        f"mujoco: the scene as shipped, b* = {' or '.join(f'{share:.3g}' for share in sorted(shipped))} k.",
+        f"Attached: above {THRESHOLD_SHARE:g} b*. Prior sd {common.prior_sd:.3g} k, "
+        f"force sd {common.force_sd:g} k x spacing,",
+        f"but {EXACT_FORCE_SD:g} for ours where the truth is an equilibrium of the same energy,",
+        f"{common.samples} sample a frame. f: dt = {TIME_STEP:g} s, {SWEEPS_PER_STEP} sweeps,",
+        f"hinges {HINGE_STIFFNESS:.3g} k. Adam: rate {adam.RATE:g} k, {adam.ADAM_STEPS} steps a frame.",
+        f"{unscented.PATCHES} patches. Ours: attached where P > 0.5, with P / (1 - P) beforehand of",
+        f"{common.prior.probability / (1 - common.prior.probability):.3g} times e^{common.prior.coupling:g}",
+        f"for each attached neighbour, and b / (b + k) from {common.prior.components[0]:g} up where attached.",
+        "Printed: one run each, b* = 0.1, b_thresh = 0.05, no units, no noise.",
     )

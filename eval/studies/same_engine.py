@@ -1,12 +1,12 @@
-"""A truth made by the estimator's own engine, as in the paper's simulated experiments: no gap but the noise.
+"""A truth made by the estimator's own engine, as in the paper's simulated experiments: no model error but the noise.
 
-Mesh, attached vertices and grasps are a scene's; stiffness, height and increments are the paper's or stated here. Every
-grasp begins at rest, and the held particles hang on the estimator's own springs. Two engines:
+Mesh, attached vertices and grasps come from a scene; stiffness, height and increments are the paper's or given here.
+Every grasp begins at rest, and springs as in the estimator's model hold the grasped particles. Two engines:
 
 - `xpbd`: x_t+1 = f(x_t, u_t, b*), the simulator inside the explicit filter. No weight, no bed.
 - `equilibrium`: argmin U(x; b*, u) of the implicit filter's energy, weight and bed included.
 
-The estimator is told the mesh, and which particles are held; it sees every particle with noise, which a seed draws.
+The estimator gets the mesh, and which particles are held. It sees every particle with noise, which a seed draws.
 """
 
 from collections.abc import Iterator
@@ -37,21 +37,30 @@ from jiggle_mj.truth import Truth, TruthFrame
 
 Engine = Literal["xpbd", "equilibrium"]
 
-STIFFNESS = 0.01
-"""b* of each attached particle [membrane stiffness]; the paper's 0.1 has no unit, and its membrane's is not stated."""
-NOISE = 2e-4
-"""Standard deviation of each coordinate [m]; the paper states none."""
-HEIGHT, INCREMENTS = 0.5, 5
-"""Of a lift: share of the sheet's width, as in the paper, and number of moves."""
+STIFFNESS_SHARE = 0.01
+"""b* of each attached particle [membrane stiffness].
+
+The paper's 0.1 has no unit, and the stiffness of its membrane is not given.
+"""
+POINT_SD = 2e-4
+"""Standard deviation of each coordinate [m]; the paper gives none."""
+LIFT_SHARE = 0.5
+"""Height of a lift as a share of the sheet's width, as in the paper."""
+LIFT_INCREMENTS = 5
+"""Moves of a lift."""
 FORCE_TOLERANCE = 1e-6
-"""Of an equilibrium [N]; a particle weighs 1.6e-4."""
-AWAY = np.array([0.0, 0.0, 0.5])
-"""The tip before the first grasp [m]."""
+"""Largest residual force of an equilibrium [N]; a particle weighs 1.6e-4."""
+MAX_STEPS = 1000
+"""Most steps of the search for an equilibrium."""
+OPEN_TIP = np.array([0.0, 0.0, 0.5])
+"""Place of the tip before the first grasp [m], far above the sheet."""
+OPEN_RADIUS = 1e-9
+"""Radius of the jaws before the first grasp [m]: no particle is inside."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SameEngine:
-    """What the estimator is told, what it sees, and what only the scoring may read."""
+    """What is declared to the estimator, what it sees, and the truth that only the scoring may read."""
 
     declaration: Declaration
     observations: tuple[Observation, ...]
@@ -67,17 +76,23 @@ class _Moment:
 
 
 def same_engine(
-    scene: Scene, engine: Engine, *, seed: int, grasps: int = 4, stiffness: float = STIFFNESS, noise: float = NOISE
+    scene: Scene,
+    engine: Engine,
+    *,
+    seed: int,
+    grasps: int = 4,
+    stiffness: float = STIFFNESS_SHARE,
+    noise: float = POINT_SD,
 ) -> SameEngine:
     """Lift the sheet, and observe it with noise.
 
     Args:
-        scene: whose sheet and shapes; their stiffness is not used.
-        engine: what computes the truth.
+        scene: gives sheet and shapes; their stiffness is not used.
+        engine: computes the truth.
         seed: of the noise, and of nothing else.
         grasps: corners that are lifted, one after the other.
         stiffness: of an attached particle, as a share of the membrane stiffness.
-        noise: standard deviation of each observed coordinate [m]; stated as such to the estimator.
+        noise: standard deviation of each observed coordinate [m]; the estimator gets the same number.
     """
     mesh, attached = sheet(scene)
     declaration, moments = _moments(scene, engine, grasps, stiffness)
@@ -98,7 +113,7 @@ def same_engine(
 
 
 def sheet(scene: Scene) -> tuple[SheetMesh, Bool[np.ndarray, " n"]]:
-    """The scene's mesh, flat at the height 0, and its attached particles."""
+    """Return the scene's mesh, flat at the height 0, and its attached particles."""
     tissue = scene.tissue
     flat = build_sheet(size=tissue.size, spacing=tissue.spacing, kind=tissue.mesh, seed=tissue.seed)
     rest = np.column_stack([flat.vertices, np.zeros(len(flat.vertices))])
@@ -107,34 +122,35 @@ def sheet(scene: Scene) -> tuple[SheetMesh, Bool[np.ndarray, " n"]]:
 
 @cache
 def _moments(scene: Scene, engine: Engine, grasps: int, stiffness: float) -> tuple[Declaration, tuple[_Moment, ...]]:
-    """The declaration and all frames; the same for every seed."""
+    """Return the declaration and all frames; the same for every seed."""
     mesh, attached = sheet(scene)
-    named = DeclaredMesh(vertices=mesh.rest, faces=mesh.faces, track_id=np.arange(mesh.n))
-    declaration = replace(scene.declared.declaration(), mesh=named)
+    declared_mesh = DeclaredMesh(vertices=mesh.rest, faces=mesh.faces, track_id=np.arange(mesh.n))
+    declaration = replace(scene.declared.declaration(), mesh=declared_mesh)
     if engine == "xpbd":
         declaration = replace(declaration, gravity=(0.0, 0.0, 0.0), bed=False)
     with jax.enable_x64(True), one_thread():
         b = jnp.asarray(stiffness * declaration.membrane_stiffness * attached)
         step = (_xpbd if engine == "xpbd" else _equilibrium)(mesh, declaration, b)
-        return declaration, tuple(_carried_out(_actions(scene, grasps), mesh, declaration, step))
+        return declaration, tuple(_executed(_actions(scene, grasps), mesh, declaration, step))
 
 
 def _actions(scene: Scene, grasps: int) -> Iterator[Action]:
-    """The scene's programme with the paper's lifts."""
-    height = HEIGHT * scene.tissue.size[0]
-    plan = replace(scene.programme, height=height, increments=INCREMENTS, still_frames=1, lowering=0)
-    begun = 0
+    """Yield the scene's programme with the paper's lifts."""
+    height = LIFT_SHARE * scene.tissue.size[0]
+    plan = replace(scene.programme, height=height, increments=LIFT_INCREMENTS, still_frames=1, lowering=0)
+    n_grasps = 0
     for action in programme(replace(scene, programme=plan)):
-        begun += isinstance(action, Grasp)
-        if begun > grasps:
+        n_grasps += isinstance(action, Grasp)
+        if n_grasps > grasps:
             return
         if not isinstance(action, Release):
             yield action
 
 
-def _carried_out(actions: Iterator[Action], mesh: SheetMesh, declaration: Declaration, step) -> Iterator[_Moment]:
+def _executed(actions: Iterator[Action], mesh: SheetMesh, declaration: Declaration, step) -> Iterator[_Moment]:
+    """Yield the frame after each action."""
     grip, x, stiff = None, mesh.rest, EstimatorConfig().grip_stiffness * declaration.membrane_stiffness
-    tool = ToolState(position=AWAY, quat_wxyz=np.eye(4)[0], closed=False, grasp=0, radius=1e-9)
+    tool = ToolState(position=OPEN_TIP, quat_wxyz=np.eye(4)[0], closed=False, grasp=0, radius=OPEN_RADIUS)
     for action in actions:
         if isinstance(action, Grasp):
             x = mesh.rest
@@ -150,21 +166,22 @@ def _carried_out(actions: Iterator[Action], mesh: SheetMesh, declaration: Declar
 
 
 def _xpbd(mesh: SheetMesh, declaration: Declaration, b):
-    """The explicit filter's f."""
+    """Return the explicit filter's f."""
     f = eqx.filter_jit(simulator(mesh, declaration).step)
     return lambda x, grip: np.asarray(f(jnp.asarray(x), b, grip, sweeps=SWEEPS_PER_STEP))
 
 
 def _equilibrium(mesh: SheetMesh, declaration: Declaration, b):
-    """Argmin U, searched from the frame before."""
+    """Return the search for argmin U from the frame before."""
     energy, search = surrogate(mesh, declaration), eqx.filter_jit(equilibrium)
 
     def step(x, grip):
         gripped = SheetEnergy.build(mesh.rest, (*energy.terms, grip), energy.layout)
-        found = search(gripped, b, jnp.asarray(x), force_tolerance=FORCE_TOLERANCE, max_steps=1000)
+        found = search(gripped, b, jnp.asarray(x), force_tolerance=FORCE_TOLERANCE, max_steps=MAX_STEPS)
         if not found.converged:
             raise RuntimeError(
-                f"the truth's equilibrium stopped at {float(found.force):.2g} N after {found.steps} steps."
+                f"the equilibrium of the truth did not converge: the residual is {float(found.force):.2g} N after "
+                f"{found.steps} steps; {FORCE_TOLERANCE:g} N is allowed."
             )
         return np.asarray(found.x)
 

@@ -1,11 +1,16 @@
 """How planning grows with the sheet: seconds for one action of the paper's SL-D and for one of ours, at each size.
 
-SL-D: 100 samples, five iterations. Ours, as `InformationPolicy` plans where the jaws are: all pulls in one tissue and
-the likeliest in another for what they teach; the place of the tip in sixteen, for what the energy was predicted to be;
-and one step in sixteen, for whether it is safe. Other places are not looked at. Compilation is not counted.
+SL-D draws 100 samples in five iterations. Ours is what `InformationPolicy` computes where the jaws are: all pulls in
+one tissue and the likeliest in another, for what they teach; the place of the tip in sixteen, for the energy that was
+predicted there; and one step in sixteen, for whether it is safe. Other places are not evaluated. Compilation is not
+counted.
 """
 
-from collections.abc import Callable, Iterable
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -17,38 +22,83 @@ from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.planning.information_config import InformationPolicyConfig
 from jiggle_mj.estimator.planning.outcomes import outcomes
 from jiggle_mj.estimator.planning.pull_predictor import CandidatePull, PullPredictor
+from jiggle_mj.recording.declaration import is_current, made_by
 
-from ..benchmark.estimator_benchmark import NOISE, Case, case, sl_d, timed
+from ..benchmark.estimator_benchmark import POINT_SD, Case, case, sl_d, timed
+from .figures import UNDEFINED
+from .study import Study, Table
 
-SIZES = (600, 1200, 2400)
+PARTICLE_COUNTS = (600, 1200, 2400)
+"""About how many particles the sheets have: the paper's two sizes, and twice the larger."""
 PRINTED = {600: 2.9, 1200: 4.5}
 """Seconds for an action of SL-D in the paper."""
-
-Times = dict[int, tuple[float, float]]
-"""Seconds of SL-D and ours, by size."""
-
-
-def scalability(sizes: Iterable[int], *, log: Callable[[str], None]) -> Times:
-    """Measure on whatever device is there; `log` is told what comes next."""
-    found: Times = {}
-    with jax.enable_x64(True), one_thread():
-        for n in sizes:
-            log(f"n = {n}")
-            one = case(n)
-            _, theirs = timed(sl_d(one), repeats=3)
-            _, ours = timed(our_plan(one), repeats=3)
-            found[n] = theirs, ours
-    return found
+REPEATS = 3
+"""Plans of which the median is reported."""
 
 
-def our_plan(one: Case) -> Callable[[], object]:
-    """What `InformationPolicy` asks of a grasp: what pulls teach, and whether the best is safe."""
-    filter = build_filter(one.mesh, one.declaration, EstimatorConfig()).by_forces("predicts pulls")
+@dataclass(frozen=True)
+class PlanTimes:
+    """Median seconds of one plan."""
+
+    sl_d_s: float
+    """Seconds of the paper's SL-D."""
+    ours_s: float
+    """Seconds of ours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScalabilityStudy(Study[int, PlanTimes]):
+    """The study of planning times; a cell is a number of particles."""
+
+    default_seeds: ClassVar[range] = range(0)
+    sizes: tuple[int, ...] = PARTICLE_COUNTS
+
+    def cells(self, seeds: Iterable[int]) -> tuple[int, ...]:
+        """Return the sizes; nothing is drawn, so seeds are not used."""
+        return self.sizes
+
+    def name(self, cell: int) -> str:
+        """Return the name of the file that keeps the times of this size."""
+        return f"{cell}.json"
+
+    def run_cell(self, cell: int, path: Path) -> None:
+        """Measure on whatever device JAX has, and write the times."""
+        with jax.enable_x64(True), one_thread():
+            lift = case(cell)
+            _, theirs = timed(sl_d(lift), repeats=REPEATS)
+            _, ours = timed(our_plan(lift), repeats=REPEATS)
+        times = vars(PlanTimes(sl_d_s=theirs, ours_s=ours))
+        path.write_text(json.dumps(made_by() | {"device": _device(), "times": times}, indent=1) + "\n")
+
+    def is_current(self, cell: int, path: Path) -> bool:
+        """Say whether this version measured this size on this kind of device."""
+        if not path.exists():
+            return False
+        kept = json.loads(path.read_text())
+        return is_current(kept) and kept["device"] == _device()
+
+    def read(self, cell: int, path: Path) -> PlanTimes:
+        """Read the times of one size."""
+        return PlanTimes(**json.loads(path.read_text())["times"])
+
+    def summarise(self, results: Mapping[int, PlanTimes]) -> Table:
+        """Return a row for each size, with the paper's printed seconds."""
+        rows = []
+        for n, times in results.items():
+            printed = f"{PRINTED[n]:g} s" if n in PRINTED else UNDEFINED
+            rows.append((str(n), printed, f"{times.sl_d_s:.2g} s", f"{times.ours_s:.2g} s"))
+        note = f"Medians of three on {_device()}, compilation left out; the paper names no device."
+        return Table(headings=("n", "SL-D, paper", "SL-D", "ours"), rows=tuple(rows), beneath=("", note))
+
+
+def our_plan(lift: Case) -> Callable[[], object]:
+    """Return a call that computes what `InformationPolicy` asks of a grasp: what pulls teach, and what is safe."""
+    filter = build_filter(lift.mesh, lift.declaration, EstimatorConfig()).by_forces("predicts pulls")
     state = filter.init(jax.random.key(0))
     belief = filter.belief(state)
     everywhere = jnp.ones(len(belief.shift), dtype=bool)
-    predictor = PullPredictor.build(filter.balance(state), belief, jnp.eye(3) / NOISE**2, everywhere)
-    pull, held = one.frames[-1].pull, one.frames[-1].held
+    predictor = PullPredictor.build(filter.balance(state), belief, jnp.eye(3) / POINT_SD**2, everywhere)
+    pull, held = lift.frames[-1].pull, lift.frames[-1].held
     assert pull is not None
     config = InformationPolicyConfig()
     ends = pull.before[None] + jnp.asarray(config.pulls)[:, None]
@@ -63,22 +113,16 @@ def our_plan(one: Case) -> Callable[[], object]:
         jax.tree.map(lambda leaf, count=count: leaf[:count], candidates) for count in (config.n_refined_pulls, 1)
     )
     here = eqx.tree_at(lambda candidate: candidate.to, step, step.start)
-    s = belief.bounded(one.b)
+    s = belief.bounded(lift.b)
 
     def plan() -> object:
         counts = 1, config.n_gain_scenarios - 1, config.n_safety_scenarios
         first, more, refined = (jnp.broadcast_to(s[None], (count, len(s))) for count in counts)
-        told = outcomes(predictor, candidates, first), outcomes(predictor, likely, more)
-        return told, [outcomes(predictor, candidate, refined, informative=False) for candidate in (here, step)]
+        gains = outcomes(predictor, candidates, first), outcomes(predictor, likely, more)
+        return gains, [outcomes(predictor, candidate, refined, informative=False) for candidate in (here, step)]
 
     return plan
 
 
-def markdown(times: Times) -> str:
-    """A line for each size, the paper's printed seconds beside it."""
-    device = jax.devices()[0].device_kind
-    lines = ["| n | SL-D, paper | SL-D | ours |", "|---|---|---|---|"]
-    for n, (theirs, ours) in times.items():
-        printed = f"{PRINTED[n]:g} s" if n in PRINTED else "\N{EN DASH}"
-        lines.append(f"| {n} | {printed} | {theirs:.2g} s | {ours:.2g} s |")
-    return "\n".join([*lines, "", f"Medians of three on {device}, compilation left out; the paper names no device."])
+def _device() -> str:
+    return jax.devices()[0].device_kind

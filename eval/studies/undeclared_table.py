@@ -1,12 +1,11 @@
 """Whether closing the loop names what a scene holds and nobody declares: the panel, run and counted."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Executor
-from functools import partial
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.stats import norm
@@ -18,124 +17,145 @@ from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.scenes import Reference, programme
 
 from ..runs.closing_the_loop import DISCREPANCY, close_loop
-from .main_table import carry_out
+from .study import Study, Table
 from .undeclared_panel import IMAGES, INSIDE, NOTHING, OUTSIDE, ROWS, TOGETHER, PanelRow, scene_with
 
-Found = dict[tuple[str, int], dict[str, Any]]
-"""discrepancy.json by what is undeclared and seed."""
+COVERAGE = 0.95
+"""Probability that the intervals of an effect's parameters are meant to hold."""
+SHOWN_PARAMETERS = 3
+"""Parameters of an effect that a cell shows; more are cut off."""
+
+Discrepancy = Mapping[str, Any]
+"""Content of discrepancy.json."""
 
 
-def measure(
-    names: Iterable[str], seeds: Iterable[int], directory: Path, *, executor: Executor, log: Callable[[str], None]
-) -> Found:
-    """Run what has not been run by this version, and read all of it.
+@dataclass(frozen=True, kw_only=True)
+class UndeclaredCell:
+    """One run: a row of the panel and a seed."""
 
-    Args:
-        names: of the panel's rows.
-        seeds: of mesh, noise and scene.
-        directory: holds a folder for each.
-        executor: runs several at a time.
-        log: told of each that is done.
-    """
-    folders = {(name, seed): directory / _folder(name, seed) for name, seed in product(names, seeds)}
-    left = {
-        folder.name: partial(_run, *key, folder) for key, folder in folders.items() if not _done(folder / DISCREPANCY)
-    }
-    carry_out(left, executor, log=log)
-    return {key: json.loads((folder / DISCREPANCY).read_text()) for key, folder in folders.items()}
+    row: str
+    """Name of the panel's row."""
+    seed: int
+    """Seed of mesh, noise and scene."""
 
 
-def _folder(name: str, seed: int) -> str:
-    return f"{name.replace(',', '').replace(' ', '_')}-{seed}"
+@dataclass(frozen=True, kw_only=True)
+class UndeclaredStudy(Study[UndeclaredCell, Discrepancy]):
+    """The study of undeclared effects."""
+
+    default_seeds: ClassVar[range] = range(5)
+    rows: tuple[str, ...] = tuple(ROWS)
+    """Names of the panel's rows."""
+
+    def cells(self, seeds: Iterable[int]) -> tuple[UndeclaredCell, ...]:
+        """Return every row with every seed."""
+        return tuple(UndeclaredCell(row=row, seed=seed) for row, seed in product(self.rows, seeds))
+
+    def name(self, cell: UndeclaredCell) -> str:
+        """Return the run's folder name."""
+        return f"{cell.row.replace(',', '').replace(' ', '_')}-{cell.seed}"
+
+    def run_cell(self, cell: UndeclaredCell, path: Path) -> None:
+        """Record the row's scene, and close the loop over the recording."""
+        path.mkdir(parents=True, exist_ok=True)
+        scene, recording = scene_with(cell.row, cell.seed), path / "run.mcap"
+        with Reference(scene, seed=cell.seed, sensing=ROWS[cell.row].sensing) as reference:
+            for _ in observe(reference, programme(scene), recording, seed=cell.seed, overwrite=True):
+                pass
+        close_loop(recording, path, truth=truth_path(recording), overwrite=True)
+
+    def is_current(self, cell: UndeclaredCell, path: Path) -> bool:
+        """Say whether this version wrote the folder's discrepancy.json."""
+        file = path / DISCREPANCY
+        return file.exists() and is_current(json.loads(file.read_text()))
+
+    def read(self, cell: UndeclaredCell, path: Path) -> Discrepancy:
+        """Read discrepancy.json."""
+        return json.loads((path / DISCREPANCY).read_text())
+
+    def summarise(self, results: Mapping[UndeclaredCell, Discrepancy]) -> Table:
+        """Return a row for each row of the panel, and sums over its groups beneath."""
+        rows = []
+        for name in dict.fromkeys(cell.row for cell in results):
+            runs = [found for cell, found in results.items() if cell.row == name]
+            errors = [(1e3 * run["held_out"]["before_rms_m"], 1e3 * run["held_out"]["after_rms_m"]) for run in runs]
+            rows.append(
+                (
+                    name,
+                    _counted([", ".join(named(run)) or "nothing" for run in runs]),
+                    _counted([run["verdict"] for run in runs]),
+                    "; ".join(_theta(run) for run in runs),
+                    "; ".join(f"{before:.2f} → {after:.2f}" for before, after in errors),
+                    "; ".join(f"{_pug(run, 'before')} → {_pug(run, 'after')}" for run in runs),
+                )
+            )
+        held_out = "held-out mm, before → after"
+        return Table(
+            headings=("undeclared", "named (of seeds)", "verdicts", "theta (sd)", held_out, "PUG at one ring"),
+            rows=tuple(rows),
+            beneath=("", *_sums(results)),
+        )
 
 
-def _done(file: Path) -> bool:
-    return file.exists() and is_current(json.loads(file.read_text()))
+def named(found: Discrepancy) -> list[str]:
+    """Return the effects that a run names, and those that the data cannot distinguish from them."""
+    return [effect["name"] for effect in found["effects"]] + found["ambiguous_with"]
 
 
-def _run(undeclared: str, seed: int, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    scene, recording = scene_with(undeclared, seed), folder / "run.mcap"
-    with Reference(scene, seed=seed, sensing=ROWS[undeclared].sensing) as reference:
-        for _ in observe(reference, programme(scene), recording, seed=seed, overwrite=True):
-            pass
-    close_loop(recording, folder, truth=truth_path(recording), overwrite=True)
+Runs = list[tuple[PanelRow, Discrepancy]]
 
 
-def named(found: Mapping[str, Any]) -> list[str]:
-    """Effects that a run names, with those that they could not be told from."""
-    return [one["name"] for one in found["effects"]] + found["ambiguous_with"]
-
-
-def markdown(runs: Found) -> str:
-    """A line for each that was undeclared, and sums."""
-    lines = [
-        "| undeclared | named (of seeds) | verdicts | theta (sd) | held-out mm, before → after | PUG at one ring |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name in dict.fromkeys(name for name, _ in runs):
-        mine = [found for (one, _), found in runs.items() if one == name]
-        held = [(1e3 * one["held_out"]["before_rms_m"], 1e3 * one["held_out"]["after_rms_m"]) for one in mine]
-        cells = [
-            _counted([", ".join(named(one)) or "nothing" for one in mine]),
-            _counted([one["verdict"] for one in mine]),
-            "; ".join(_theta(one) for one in mine),
-            "; ".join(f"{before:.2f} → {after:.2f}" for before, after in held),
-            "; ".join(f"{_pug(one, 'before')} → {_pug(one, 'after')}" for one in mine),
-        ]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", *_sums(runs)])
-
-
-def _sums(runs: Found) -> list[str]:
-    said = []
+def _sums(results: Mapping[UndeclaredCell, Discrepancy]) -> list[str]:
+    sentences = []
     for what, rows in (("One effect", INSIDE), ("Two effects", TOGETHER), ("One effect, from images", IMAGES)):
-        if mine := [(ROWS[name], found) for (name, _), found in runs.items() if name in rows]:
-            said.append(f"{what}: {_right(mine)}; {_gained([found for _, found in mine])}; {_covered(mine)}.")
-    if nothing := [found for (name, _), found in runs.items() if name in NOTHING]:
-        said.append(f"Nothing undeclared: {sum(bool(one['effects']) for one in nothing)} of {len(nothing)} named.")
-    if outside := [found for (name, _), found in runs.items() if name in OUTSIDE]:
-        honest = sum(one["verdict"] in UNEXPLAINED for one in outside)
-        said.append(f"Not in the library: {honest} of {len(outside)} unexplained or with a remainder.")
-    return said
+        if runs := [(ROWS[cell.row], found) for cell, found in results.items() if cell.row in rows]:
+            gained = _gained([found for _, found in runs])
+            sentences.append(f"{what}: {_right(runs)}; {gained}; {_covered(runs)}.")
+    if nothing := [found for cell, found in results.items() if cell.row in NOTHING]:
+        named_runs = sum(bool(found["effects"]) for found in nothing)
+        sentences.append(f"Nothing undeclared: {named_runs} of {len(nothing)} named.")
+    if outside := [found for cell, found in results.items() if cell.row in OUTSIDE]:
+        honest = sum(found["verdict"] in UNEXPLAINED for found in outside)
+        sentences.append(f"Not in the library: {honest} of {len(outside)} unexplained or with a remainder.")
+    return sentences
 
 
-def _right(runs: list[tuple[PanelRow, dict[str, Any]]]) -> str:
-    """How often each effect of a row was added, and how often it was among those named."""
-    added = sum({one["name"] for one in found["effects"]} >= set(row.effects) for row, found in runs)
+def _right(runs: Runs) -> str:
+    """Say how often each effect of a row was added, and how often it was among those named."""
+    added = sum({effect["name"] for effect in found["effects"]} >= set(row.effects) for row, found in runs)
     first = sum(found["effects"][:1] != [] and found["effects"][0]["name"] in row.effects for row, found in runs)
     among = sum(set(named(found)) >= set(row.effects) for row, found in runs)
     return f"named first in {first} of {len(runs)}, all added in {added}, all among those named in {among}"
 
 
-def _covered(runs: list[tuple[PanelRow, dict[str, Any]]]) -> str:
-    """How many parameters of effects that were added lie within 95 % intervals, of those with a true value."""
+def _covered(runs: Runs) -> str:
+    """Say how many parameters with a true value lie within their interval, over the effects that were added."""
     within = [
-        abs(theta - true) <= norm.ppf(0.975) * sd
+        abs(theta - true) <= norm.ppf((1 + COVERAGE) / 2) * sd
         for row, found in runs
-        for one in found["effects"]
-        for theta, sd, true in zip(one["theta"], one["sd"], row.sizes.get(one["name"], ()), strict=False)
+        for effect in found["effects"]
+        for theta, sd, true in zip(effect["theta"], effect["sd"], row.sizes.get(effect["name"], ()), strict=False)
     ]
-    return f"{sum(within)} of {len(within)} parameters within their 95 % interval"
+    return f"{sum(within)} of {len(within)} parameters within their {100 * COVERAGE:g} % interval"
 
 
-def _gained(runs: list[dict[str, Any]]) -> str:
-    gains = [1 - one["held_out"]["after_rms_m"] / one["held_out"]["before_rms_m"] for one in runs]
+def _gained(runs: list[Discrepancy]) -> str:
+    gains = [1 - run["held_out"]["after_rms_m"] / run["held_out"]["before_rms_m"] for run in runs]
     return f"held-out error falls by {np.median(gains):.0%} at the median, and rises in {sum(g < 0 for g in gains)}"
 
 
-def _counted(what: list[str]) -> str:
-    return "; ".join(f"{one} ({what.count(one)})" for one in dict.fromkeys(what))
+def _counted(texts: list[str]) -> str:
+    return "; ".join(f"{text} ({texts.count(text)})" for text in dict.fromkeys(texts))
 
 
-def _theta(found: Mapping[str, Any]) -> str:
+def _theta(found: Discrepancy) -> str:
     if not found["effects"]:
         return "-"
-    one = found["effects"][0]
-    values = [f"{value:.3g} ({sd:.2g})" for value, sd in zip(one["theta"], one["sd"], strict=True)]
-    return ", ".join(values[:3]) + (" …" if len(values) > 3 else "")
+    first = found["effects"][0]
+    values = [f"{value:.3g} ({sd:.2g})" for value, sd in zip(first["theta"], first["sd"], strict=True)]
+    return ", ".join(values[:SHOWN_PARAMETERS]) + (" …" if len(values) > SHOWN_PARAMETERS else "")
 
 
-def _pug(found: Mapping[str, Any], when: str) -> str:
+def _pug(found: Discrepancy, when: str) -> str:
     pug = found[f"detection_{when}"]["by_dilation"]["1"]["pug"]
     return "-" if pug is None else f"{pug:.2f}"

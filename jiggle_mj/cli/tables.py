@@ -1,91 +1,179 @@
-"""`table`: many runs, and their figures as Markdown."""
+"""`table NAME`: many runs, and their figures as Markdown; each table has only the options that it uses."""
 
-from typing import Annotated
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ..errors import OptionError
 from ..options import Sensing
-from .options import Out, RowsName, TableName
+from .options import Out, RowsName
 from .terminal import console, log
 
+if TYPE_CHECKING:
+    from jiggle_mj.eval.studies.study import Study
 
-def table(
-    name: Annotated[TableName, tyro.conf.Positional],
-    /,
-    *,
-    out: Out,
+
+@dataclass(frozen=True, kw_only=True)
+class _TableOptions(ABC):
+    """Options of every table."""
+
+    out: Out
+    """Folder that keeps every run; what is current there is not run again."""
+
+    @abstractmethod
+    def run(self) -> None:
+        """Run the study, and print its table."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Main(_TableOptions):
+    """Table of docs/RESULTS.md: each scene from images and from particles."""
+
+    seeds: tuple[int, ...] | None = None
+    """Seeds of each row; 0 to 2 if left out."""
+
+    def run(self) -> None:
+        from jiggle_mj.eval.studies.main_table import MainStudy
+
+        _print_table(MainStudy(), self, self.seeds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Active(_TableOptions):
+    """Comparison of policies as in the paper, with ours; writes the curves to OUT/active.html."""
+
+    seeds: tuple[int, ...] | None = None
+    """Seeds of each row; 0 to 9 if left out."""
+    sensing: Sensing = "particles"
+    """What the estimator sees."""
+    jobs: int | None = None
+    """How many runs at a time; as many as there are usable cores if left out."""
+
+    def run(self) -> None:
+        from jiggle_mj.eval.studies.active_curves import PAGE, write_curves
+        from jiggle_mj.eval.studies.active_table import ActiveStudy
+
+        courses = _print_table(ActiveStudy(sensing=self.sensing), self, self.seeds, self.jobs, parallel=True)
+        write_curves(courses, self.out / PAGE)
+        console.print(f"curves: {self.out / PAGE}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Acts(_TableOptions):
+    """Whether failed cuts and sutures are noticed."""
+
+    seeds: tuple[int, ...] | None = None
+    """Seeds of each scene; 0 to 5 if left out."""
+    jobs: int | None = None
+    """How many runs at a time; as many as there are usable cores if left out."""
+
+    def run(self) -> None:
+        from jiggle_mj.eval.studies.acts_table import ActsStudy
+
+        _print_table(ActsStudy(), self, self.seeds, self.jobs, parallel=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Undeclared(_TableOptions):
+    """Whether close-loop names what nobody declares."""
+
+    seeds: tuple[int, ...] | None = None
+    """Seeds of each row; 0 to 4 if left out."""
+    rows: tuple[RowsName, ...] | None = None
+    """Rows of the panel: one effect of the library, two together, one from images, what is outside the library, or
+    nothing; all if left out."""
+    jobs: int | None = None
+    """How many runs at a time; as many as there are usable cores if left out."""
+
+    def run(self) -> None:
+        from jiggle_mj.eval.studies.undeclared_panel import GROUPS
+        from jiggle_mj.eval.studies.undeclared_table import UndeclaredStudy
+
+        rows = tuple(row for group in self.rows or GROUPS for row in GROUPS[group])
+        _print_table(UndeclaredStudy(rows=rows), self, self.seeds, self.jobs, parallel=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scalability(_TableOptions):
+    """Seconds of a plan at three sizes, on this machine."""
+
+    def run(self) -> None:
+        from jiggle_mj.eval.studies.scalability import ScalabilityStudy
+
+        _print_table(ScalabilityStudy(), self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Paper(_TableOptions):
+    seeds: tuple[int, ...] | None = None
+    """Seeds of each row; 0 to 9 if left out."""
+
+    def _run(self, name: str) -> None:
+        from jiggle_mj.eval.studies.paper_tables import TABLES, PaperStudy
+
+        _print_table(PaperStudy(table=TABLES[name]), self, self.seeds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Simulation(_Paper):
+    """Table of the paper with four lifts, printed beside measured, with all baselines."""
+
+    def run(self) -> None:
+        self._run("simulation")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OneLift(_Paper):
+    """Table of the paper's appendix with one lift, printed beside measured, with all baselines."""
+
+    def run(self) -> None:
+        self._run("one-lift")
+
+
+Tables = (
+    Annotated[_Main, tyro.conf.subcommand("main")]
+    | Annotated[_Active, tyro.conf.subcommand("active")]
+    | Annotated[_Acts, tyro.conf.subcommand("acts")]
+    | Annotated[_Undeclared, tyro.conf.subcommand("undeclared")]
+    | Annotated[_Scalability, tyro.conf.subcommand("scalability")]
+    | Annotated[_Simulation, tyro.conf.subcommand("simulation")]
+    | Annotated[_OneLift, tyro.conf.subcommand("one-lift")]
+)
+"""One subcommand for each table."""
+
+
+def table(name: tyro.conf.OmitSubcommandPrefixes[tyro.conf.OmitArgPrefixes[Tables]]) -> None:
+    """Run a table of scenes and seeds, and print it as Markdown; what is current in OUT is not run again."""
+    name.run()
+
+
+def _print_table(
+    study: "Study[Any, Any]",
+    options: _TableOptions,
     seeds: tuple[int, ...] | None = None,
-    sensing: Sensing | None = None,
     jobs: int | None = None,
-    rows: tuple[RowsName, ...] | None = None,
-) -> None:
-    """Run a table of scenes and seeds, and print it as Markdown; what is in OUT already is not run again.
+    *,
+    parallel: bool = False,
+) -> dict[Any, Any]:
+    """Run a study, print its table, and return the results of its cells.
 
     Args:
-        name: main is that of docs/RESULTS.md; active is the paper's comparison of policies, with ours; acts is whether
-            failed cuts and sutures are noticed; undeclared is whether close-loop names what nobody declares;
-            scalability times plans at three sizes, on this machine; simulation and one-lift are the paper's, with its
-            printed figures and all baselines.
-        out: holds a folder for each run, and of active the curves, active.html.
-        seeds: of each row; 0 to 2 for main, 0 to 5 for acts, 0 to 4 for undeclared and 0 to 9 for the paper's if left
-            out.
-        sensing: of active; particles if left out.
-        jobs: of active, acts and undeclared: how many runs at a time; as many as there are usable cores if left out.
-        rows: of undeclared: one effect of the library, two together, one from images, what is outside the library, or
-            nothing; all if left out.
+        study: what to run.
+        options: of the table.
+        seeds: the study's own if None.
+        jobs: processes, for a study that runs in parallel; one for each usable core if None.
+        parallel: run in processes of their own.
     """
-    from jiggle_mj.eval.studies import main_table as tables
-    from jiggle_mj.eval.studies import paper_tables
+    from jiggle_mj.eval.studies.study import run_study
 
-    if sensing is not None and name != "active":
-        raise OptionError(f"--sensing is for the table active; got {name}.")
-    if jobs is not None and name not in ("active", "acts", "undeclared"):
-        raise OptionError(f"--jobs is for the tables active, acts and undeclared; got {name}.")
-    if rows is not None and name != "undeclared":
-        raise OptionError(f"--rows is for the table undeclared; got {name}.")
-    if name == "main":
-        print(tables.markdown(tables.measure(tables.MAIN, seeds or range(3), out, log=log)))
-    elif name == "active":
-        from jiggle_mj.eval.studies import active_table
+    from ..worker_processes import WorkerProcesses
 
-        from ..worker_processes import WorkerProcesses
-
+    cells = study.cells(study.default_seeds if seeds is None else seeds)
+    if parallel:
         with WorkerProcesses(jobs) as executor:
-            runs = active_table.measure(
-                active_table.SCENES,
-                active_table.POLICIES,
-                seeds or range(10),
-                out,
-                sensing=sensing or "particles",
-                executor=executor,
-                log=log,
-            )
-        print(active_table.markdown(runs))
-        active_table.write_curves(runs, out / active_table.FILE)
-        console.print(f"curves: {out / active_table.FILE}")
-    elif name == "acts":
-        from jiggle_mj.eval.studies import acts_table
-
-        from ..worker_processes import WorkerProcesses
-
-        with WorkerProcesses(jobs) as executor:
-            found = acts_table.measure(acts_table.SCENES, seeds or range(6), out, executor=executor, log=log)
-        print(acts_table.markdown(found))
-    elif name == "undeclared":
-        from jiggle_mj.eval.studies import undeclared_table as undeclared
-        from jiggle_mj.eval.studies.undeclared_panel import GROUPS
-
-        from ..worker_processes import WorkerProcesses
-
-        names = [name for group in (rows or GROUPS) for name in GROUPS[group]]
-        with WorkerProcesses(jobs) as executor:
-            closed = undeclared.measure(names, seeds or range(5), out, executor=executor, log=log)
-        print(undeclared.markdown(closed))
-    elif name == "scalability":
-        from jiggle_mj.eval.studies import scalability
-
-        print(scalability.markdown(scalability.scalability(scalability.SIZES, log=log)))
+            results = run_study(study, cells, options.out, executor=executor, log=log)
     else:
-        table, cells = paper_tables.TABLES[name], paper_tables.cells()
-        print(paper_tables.markdown(table, paper_tables.measure(table, cells, seeds or range(10), out, log=log)))
+        results = run_study(study, cells, options.out, log=log)
+    print(study.to_markdown(results))
+    return results

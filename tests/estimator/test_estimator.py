@@ -152,7 +152,9 @@ def test_two_sheets_of_points_are_refused():
 
 def test_too_few_points_are_refused():
     estimator = Estimator(DECLARATION)
-    with pytest.raises(PerceptionError, match="10 points are seen in at least 50% of the 2 frames at rest; a sheet needs 20"):
+    with pytest.raises(
+        PerceptionError, match="10 points are seen in at least 50% of the 2 frames at rest; a sheet needs 20"
+    ):
         for one in episode()[:3]:
             points = MeasuredPoints(positions=one.points.positions[:10], track_id=np.arange(10), sd=NOISE)
             estimator.update(dataclasses.replace(one, points=points))

@@ -12,7 +12,7 @@ from jiggle_mj.estimator.attribution.sheet import PredictedSheet
 from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.estimator.effects.sheet_model import centred
-from jiggle_mj.estimator.filters.evidence import PosteriorSummary
+from jiggle_mj.estimator.filters.posterior_summary import PosteriorSummary
 from tests.support.small_sheet import sheet, sheet_balance, sheet_prior
 
 

@@ -39,7 +39,7 @@
 
   const kinds = truth
     ? [["free", (d, t) => !d && !t, { color: "#d3dae1", size: 3.5, symbol: "circle" }],
-       ["right", (d, t) => d && t, { color: colours.seen, size: 7, symbol: "circle" }],
+       ["correct", (d, t) => d && t, { color: colours.seen, size: 7, symbol: "circle" }],
        ["missed", (d, t) => !d && t, { color: colours.red, size: 7, symbol: "circle-open", line: { width: 2 } }],
        ["false", (d, t) => d && !t, { color: colours.red, size: 7.5, symbol: "x" }]]
     : [["not reported", (d) => !d, { color: "#d3dae1", size: 3.5, symbol: "circle" }],
@@ -68,7 +68,7 @@
   const line = (name, y, colour, axis) => ({ type: "scatter", mode: "lines+markers", marker: { size: 4 }, name, x: series.index, y, line: { color: colour, width: 1.6 }, yaxis: axis, xaxis: "x",
     showlegend: false, hovertemplate: `%{y:.4g}<extra>${name}</extra>` });
   const rows = [["entropy of b [nat]", [["entropy", series.entropy, colours.seen]]], ["NIS / dof", [["NIS / dof", series.nis, colours.red]]]];
-  if (series.measured_mm) rows.push(["RMS error [mm]", [["measured", series.measured_mm, colours.seen], ["believed", series.believed_mm, colours.unseen]]]);
+  if (series.measured_mm) rows.push(["RMS error [mm]", [["measured", series.measured_mm, colours.seen], ["estimated", series.estimated_mm, colours.unseen]]]);
   rows.push(["seen [%]", [["seen", series.seen.map((s) => 100 * s), colours.green]]]);
   rows.push(["energy per<br>particle [µJ]", [["boundary energy", series.energy.map((e) => (e === null ? null : 1e6 * e)), colours.ink]]]);
   if (series.update) rows.push(["time [s]", [["update", series.update, colours.seen], ["perception", series.perception, colours.unseen]]]);
@@ -112,8 +112,8 @@
   const colourBy = () => document.querySelector("input[name=colour]:checked").value;
   const state = { step: data.opening, playing: null };
   const shown = steps[state.step];
-  const ways = paths.map(({ xyz }, k) => ({ type: "scatter3d", mode: "lines", x: xyz[0], y: xyz[1], z: xyz[2], line: { color: pathColour(k), width: 5 }, hovertemplate: `grasp ${k + 1}<extra></extra>`, showlegend: false }));
-  Plotly.newPlot("solid", [solid(data.faces, shown, shown.mean, scales.b, data.top_b, "mean b [N/m]"), ...ways], solidLayout, config);
+  const gripPaths = paths.map(({ xyz }, k) => ({ type: "scatter3d", mode: "lines", x: xyz[0], y: xyz[1], z: xyz[2], line: { color: pathColour(k), width: 5 }, hovertemplate: `grasp ${k + 1}<extra></extra>`, showlegend: false }));
+  Plotly.newPlot("solid", [solid(data.faces, shown, shown.mean, scales.b, data.top_b, "mean b [N/m]"), ...gripPaths], solidLayout, config);
   const trueStep = (k) => { if (!truth) return null; for (let j = k; j >= 0; j--) if (truth.steps[j]) return truth.steps[j]; return truth.steps.find(Boolean) || null; };
   const drawsTruth = Boolean(truth && trueStep(state.step) && truth.faces.length && truth.faces[0].length);
   if (drawsTruth) {
@@ -149,12 +149,12 @@
   };
   const showPicture = (frame) => {
     if (!pictures.length) return;
-    const picture = pictures.reduce((best, one) => (Math.abs(one.step - frame) < Math.abs(best.step - frame) ? one : best));
+    const picture = pictures.reduce((best, candidate) => (Math.abs(candidate.step - frame) < Math.abs(best.step - frame) ? candidate : best));
     for (const side of ["left", "right"]) {
       document.getElementById(side).src = picture[side];
       drawPoints(side, picture);
     }
-    document.getElementById("picture-note").textContent = picture.step === frame ? "" : `nearest picture kept: frame ${series.index[picture.step]}`;
+    document.getElementById("picture-note").textContent = picture.step === frame ? "" : `nearest picture: frame ${series.index[picture.step]}`;
   };
   const show = () => {
     const step = steps[state.step], by = colourBy(), frame = step.frame;
@@ -174,7 +174,7 @@
     play.textContent = "❚❚";
     state.playing = setInterval(() => { state.step = (state.step + 1) % steps.length; slider.value = state.step; show(); }, 350);
   });
-  document.querySelectorAll("input[name=colour]").forEach((one) => one.addEventListener("change", show));
+  document.querySelectorAll("input[name=colour]").forEach((choice) => choice.addEventListener("change", show));
   if (pictures.length) document.getElementById("points").addEventListener("change", show);
   slider.value = state.step;
   show();

@@ -18,8 +18,8 @@ from jiggle_mj.estimator.filters.explicit import MultipleShooting
 from jiggle_mj.estimator.filters.filter import Filter, FilterState
 from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
 from jiggle_mj.estimator.filters.posterior_summary import Update
-from jiggle_mj.estimator.physics.simulator import simulator
 from jiggle_mj.estimator.filters.unscented import ReducedUnscented
+from jiggle_mj.estimator.physics.simulator import simulator
 from jiggle_mj.estimator.physics.xpbd import XPBD
 from tests.support.small_sheet import DECLARATION, corners, lifts, sheet, sheet_energy, sheet_filter
 

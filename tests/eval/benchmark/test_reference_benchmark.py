@@ -10,16 +10,14 @@ from jiggle_mj.scenes.tissue.model import build_tissue
 
 
 @pytest.mark.render
-def test_it_times_increments_pairs_and_an_episode(monkeypatch):
+def test_it_times_increments_pairs_and_an_episode():
     """On small meshes; the whole episode of the shipped scene is left to the benchmark itself."""
     small = bench.sized(60)
-    monkeypatch.setattr(bench, "load_scene", lambda name: small)
-    monkeypatch.setattr(bench, "PAIRS", 3)
-    metrics = bench.reference_benchmark((60, 120), log=lambda _: None)
-    small_one, large, slope = (
+    metrics = bench.reference_benchmark((60, 120), log=lambda _: None, scene=small, stereo_pairs=3)
+    small_one, large, exponent = (
         float(metrics[f"reference_increment_{end}"]["value"]) for end in ("n60_s", "n120_s", "exponent")
     )
-    assert slope == pytest.approx(np.log(large / small_one) / np.log(2))
+    assert exponent == pytest.approx(np.log(large / small_one) / np.log(2))
     assert 3 <= float(metrics["reference_increment_n60_steps"]["value"]) < 100
     assert float(metrics["reference_episode_s"]["value"]) > 8 * small_one
     assert 0 < float(metrics["stereo_pair_s"]["value"]) < 5

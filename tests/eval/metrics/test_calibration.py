@@ -29,7 +29,7 @@ def test_nees_marginalises_what_has_no_true_number():
     assert coverage(belief, np.array([np.nan, np.inf])) is None
 
 
-def test_an_honest_belief_has_unit_nees_and_covers_nine_in_ten():
+def test_a_calibrated_belief_has_unit_nees_and_covers_nine_in_ten():
     """Truths drawn from the belief itself: n NEES/dof ~ chi-square_n, and coverage is binomial(n, 0.9).
 
     n = 400 over 25 draws: the standard error of the mean NEES/dof is sqrt(2/10000) = 0.014 and that of the coverage
@@ -62,12 +62,12 @@ def test_expected_calibration_error_by_hand():
 def test_reliability_lists_the_bins_that_hold_a_particle():
     """Those of 0.85 and 0.81 share one, of which half are attached; a certainty falls into the last."""
     bins = reliability(np.array([0.85, 0.81, 0.02, 1.0]), np.array([True, False, False, True]))
-    assert [(one.low, one.high, one.count, one.attached) for one in bins] == [
+    assert [(each.low, each.high, each.count, each.attached) for each in bins] == [
         (0, 0.1, 1, 0),
         (0.8, 0.9, 2, 0.5),
         (0.9, 1, 1, 1),
     ]
-    assert [one.said for one in bins] == pytest.approx([0.02, 0.83, 1.0])
+    assert [each.predicted for each in bins] == pytest.approx([0.02, 0.83, 1.0])
 
 
 def test_no_probabilities_no_calibration_error():

@@ -1,4 +1,4 @@
-"""Detection figures, the carrying of truth and the tracking error, each against an example worked by hand."""
+"""Detection figures, the transfer of truth and the tracking error, each against an example worked by hand."""
 
 import itertools
 
@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from jiggle_mj.estimate import Estimate, Sheet
 from jiggle_mj.eval.metrics.detection import agreement, average_precision, dilate, distances, patches
-from jiggle_mj.eval.metrics.safety import borne
+from jiggle_mj.eval.metrics.safety import attachment_loads
 from jiggle_mj.eval.metrics.tracking import tracking
-from jiggle_mj.eval.metrics.truth_transfer import barycentric_weights, carry
+from jiggle_mj.eval.metrics.truth_transfer import barycentric_weights, transfer
 from jiggle_mj.truth import Truth, TruthFrame
 
 STRIP = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 6], [5, 7, 6], [6, 7, 8], [7, 9, 8]])
@@ -158,10 +158,10 @@ def test_dilation_by_two_is_dilation_twice(one):
     np.testing.assert_array_equal(dilate(one, STRIP, 2), dilate(dilate(one, STRIP, 1), STRIP, 1))
 
 
-def test_truth_carries_over_unchanged_to_the_same_mesh():
+def test_truth_is_unchanged_on_the_same_mesh():
     rest, faces = lattice(4, 0.01)
     stiffness = np.where(rest[:, 0] == 0, 0.7, 0.0)
-    transferred = carry(Sheet(rest=rest, faces=faces), truth_of(rest, faces, stiffness), 0)
+    transferred = transfer(Sheet(rest=rest, faces=faces), truth_of(rest, faces, stiffness), 0)
     np.testing.assert_array_equal(transferred.attached, stiffness > 0)
     np.testing.assert_allclose(transferred.stiffness, stiffness, atol=1e-12)
 
@@ -170,7 +170,7 @@ def test_springs_keep_their_total_and_their_centre_on_any_mesh():
     """A patch's total and first moment; the nearest vertex would give a border particle all or nothing."""
     fine, coarse = lattice(13, 0.01), lattice(7, 0.017)
     stiffness = np.where(np.linalg.norm(fine[0][:, :2] - 0.05, axis=1) < 0.023, 0.7, 0.0)
-    transferred = carry(Sheet(rest=coarse[0], faces=coarse[1]), truth_of(*fine, stiffness), 0)
+    transferred = transfer(Sheet(rest=coarse[0], faces=coarse[1]), truth_of(*fine, stiffness), 0)
     assert transferred.stiffness.sum() == pytest.approx(stiffness.sum(), rel=1e-12)
     np.testing.assert_allclose(transferred.stiffness @ coarse[0], stiffness @ fine[0], rtol=1e-12)
 
@@ -180,7 +180,7 @@ def test_a_spring_pulls_at_the_corners_of_the_triangle_that_it_is_in():
     further away than an edge is long is of another part of the tissue."""
     sheet = Sheet(rest=np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), faces=np.array([[0, 1, 2]]))
     rest = np.array([[0.2, 0.3, 0], [0, 0, 0], [0, 1, 0], [-1.5, 0, 0]])
-    transferred = carry(sheet, truth_of(rest, np.array([[0, 1, 2]]), [10.0, 0, 0, 99.0]), 0)
+    transferred = transfer(sheet, truth_of(rest, np.array([[0, 1, 2]]), [10.0, 0, 0, 99.0]), 0)
     np.testing.assert_allclose(transferred.stiffness, [5, 2, 3])
     assert transferred.attached.tolist() == [False, True, False]
 
@@ -195,28 +195,28 @@ def test_loads_add_up_in_squares_until_the_frame():
         for k, load in enumerate((3e-3, 4e-3, 1.0))
     )
     truth = Truth(rest=rest, faces=faces, attached=np.ones(4, bool), frames=frames, scene="", details={})
-    transferred = carry(Sheet(rest=rest, faces=faces), truth, 1)
+    transferred = transfer(Sheet(rest=rest, faces=faces), truth, 1)
     np.testing.assert_allclose(transferred.load, [5e-3, 0, 0, 0])
     assert transferred.observable is not None and transferred.observable.tolist() == [True, False, False, False]
-    assert carry(Sheet(rest=rest, faces=faces), truth_of(rest, faces, np.ones(4)), 0).observable is None
+    assert transfer(Sheet(rest=rest, faces=faces), truth_of(rest, faces, np.ones(4)), 0).observable is None
 
 
-def test_only_the_knowable_part_of_the_truth_has_to_be_found():
+def test_only_the_observable_part_of_the_truth_has_to_be_found():
     """A report inside the rest is no mistake."""
-    attached, knowable, detected = (chosen(*ids) for ids in ((0, 1, 2), (0,), (0, 1, 5)))
-    one = agreement(detected, attached, STRIP, 0, knowable=knowable)
+    attached, observable, detected = (chosen(*ids) for ids in ((0, 1, 2), (0,), (0, 1, 5)))
+    one = agreement(detected, attached, STRIP, 0, observable=observable)
     assert one.pcd == pytest.approx(2 / 3) and one.pug == 1
 
 
-def test_welds_unknown_amounts_and_cuts_are_carried_as_such():
+def test_welds_unknown_amounts_and_cuts_are_transferred_as_such():
     """A weld stays infinite, NaN stays attached, and a vertex cut since the start is free."""
     rest, faces = lattice(2, 0.01)
     truth = truth_of(rest, faces, [np.inf, np.nan, 0.0, 0.4])
     cut = TruthFrame(index=5, time=5, positions=rest, stiffness=np.array([np.inf, np.nan, 0, 0]), tip=np.zeros(3))
     truth = Truth(rest=rest, faces=faces, attached=truth.attached, frames=(*truth.frames, cut), scene="", details={})
     sheet = Sheet(rest=rest, faces=faces)
-    assert carry(sheet, truth, 4).attached.tolist() == [True, True, False, True]
-    late = carry(sheet, truth, 7)
+    assert transfer(sheet, truth, 4).attached.tolist() == [True, True, False, True]
+    late = transfer(sheet, truth, 7)
     assert late.attached.tolist() == [True, True, False, False]
     assert np.isinf(late.stiffness[0]) and np.isnan(late.stiffness[1]) and not late.stiffness[2:].any()
 
@@ -252,7 +252,7 @@ def test_boundary_energy_is_the_mean_over_all_vertices():
     """Two of four vertices at 2 N/m moved by 10 mm: 2 * 1/2 * 2 * 1e-4 J over 4 vertices = 5e-5 J; a weld adds none."""
     rest, faces = lattice(2, 1.0)
     moved = rest + np.array([0, 0, 0.01])
-    assert borne(truth_of(rest, faces, [2, 2, 0, 0], moved)).most == (pytest.approx(5e-5), None)
-    assert borne(truth_of(rest, faces, [2, 2, np.inf, 0], moved)).most == (pytest.approx(5e-5), None)
-    assert borne(truth_of(rest, faces, [np.nan, 0, 0, 0], moved)).most == (None, None)
-    assert borne(truth_of(rest, faces, [0, 0, 0, 0], moved)).most == (0, None)
+    assert attachment_loads(truth_of(rest, faces, [2, 2, 0, 0], moved)).most == (pytest.approx(5e-5), None)
+    assert attachment_loads(truth_of(rest, faces, [2, 2, np.inf, 0], moved)).most == (pytest.approx(5e-5), None)
+    assert attachment_loads(truth_of(rest, faces, [np.nan, 0, 0, 0], moved)).most == (None, None)
+    assert attachment_loads(truth_of(rest, faces, [0, 0, 0, 0], moved)).most == (0, None)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jiggle_mj.errors import OutputError, RecordingError
-from jiggle_mj.eval.metrics.score import read_result, score
+from jiggle_mj.eval.metrics.result_file import read_result
+from jiggle_mj.eval.metrics.score import score
 from jiggle_mj.limits import Limits
 from jiggle_mj.recording.estimate import EstimateWriter
 from jiggle_mj.recording.truth import write_truth
@@ -96,7 +97,7 @@ def test_a_tissue_without_attachments_has_no_recall_but_counts_reports():
 
 
 def test_scoring_a_folder_gives_the_figures_of_memory_and_keeps_the_timing(tmp_path):
-    """The files carry float64, so the figures are equal, and the wall times are those of the first run."""
+    """The files hold float64, so the figures are equal, and the wall times are those of the first run."""
     folder = written(tmp_path)
     figures = score(folder, folder / "run.truth.mcap")
     assert figures == json.loads((folder / "result.json").read_text()) == json.loads(json.dumps(scored()))

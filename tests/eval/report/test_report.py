@@ -15,11 +15,12 @@ import pytest
 from scipy.spatial import Delaunay
 
 from jiggle_mj.camera import StereoCamera
+from jiggle_mj.episode import Episode
 from jiggle_mj.errors import OutputError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.eval.metrics.flat_map import grid_of, outline, plane_of
-from jiggle_mj.eval.metrics.score import result, with_truth
-from jiggle_mj.eval.metrics.truth_transfer import TransferredTruth, carry
+from jiggle_mj.eval.metrics.score import Run, result, with_truth
+from jiggle_mj.eval.metrics.truth_transfer import TransferredTruth, transfer
 from jiggle_mj.eval.report.pictures import pictures
 from jiggle_mj.eval.report.run_page import write_report
 from jiggle_mj.eval.report.verdict import against_truth, doubts, found, stiffness_sums
@@ -27,7 +28,7 @@ from jiggle_mj.observation import StereoPair
 from jiggle_mj.truth import Truth, TruthFrame
 
 SIDE = 0.1
-"""Of the synthetic sheet [m]."""
+"""Side of the synthetic sheet [m]."""
 LIMIT_BYTES = 15_000_000
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or ""
 SPEED_ADVICE = ("willReadFrequently", "GPU stall due to ReadPixels")
@@ -132,18 +133,24 @@ def synthetic() -> dict:
         "belief": Belief(mean=estimates[-1].mean, covariance=np.diag(estimates[-1].sd ** 2)),
         "detection": detection,
     }
-    unscored = result(
-        scene="two lines <synthetic>",
-        seed=0,
-        sensing="stereo",
-        estimator="implicit",
-        policy="corners",
+    episode = Episode(
         sheet=sheet,
-        estimates=estimates,
+        estimates=tuple(estimates),
+        belief=run["belief"],
         detection=detection,
         prior_entropy=420.0,
         n_frames=41,
-        skipped=[(20, "the right image is missing")],
+        skipped=((20, "the right image is missing"),),
+    )
+    unscored = result(
+        Run(
+            scene="two lines <synthetic>",
+            seed=0,
+            sensing="stereo",
+            estimator="implicit",
+            policy="corners",
+            episode=episode,
+        )
     )
     camera = StereoCamera.rectified(
         width=640, height=480, focal=700.0, baseline=0.005, T_world_camera=looking_down(0.16, 35)
@@ -201,7 +208,7 @@ def test_each_combination_shows_what_it_has_and_nothing_else(tmp_path, truth, im
 
 
 @pytest.mark.parametrize("truth", [True, False])
-def test_how_acting_ended_is_told_with_its_acts_and_the_way_of_the_grip_is_drawn(tmp_path, truth):
+def test_the_page_says_how_a_policy_ended_with_its_acts_and_draws_the_path_of_the_grip(tmp_path, truth):
     acts = [{"frame": 30, "kind": "cut", "log_bayes_factor": 12.3}]
     run = synthetic()
     figures = run["unscored"] | {"ended": "nothing is attached", "policy": "detach"}
@@ -213,15 +220,15 @@ def test_how_acting_ended_is_told_with_its_acts_and_the_way_of_the_grip_is_drawn
     write_report(tmp_path / "report.html", **parts, result=figures, settings=SETTINGS)
     whole = (tmp_path / "report.html").read_text("utf-8")
     page = own_markup(whole)
-    assert "planned no more because: nothing is attached" in page and ">12.3<" in page
+    assert "ended because: nothing is attached" in page and ">12.3<" in page
     assert ("it worked</th>" in page) == truth and ("<td>no</td>" in page) == truth
-    first = next(one for one in run["estimates"] if one.held.any())
+    first = next(estimate for estimate in run["estimates"] if estimate.held.any())
     held = first.positions[first.held].mean(axis=0) * 1e3
     payload = json.loads(re.search(r'id="payload"[^>]*>(.*?)</script>', whole, flags=re.DOTALL).group(1))
     assert np.allclose([axis[0] for axis in payload["paths"][0]["xyz"]], held, atol=0.01)
 
 
-def test_doubts_are_told_where_there_are_any(tmp_path):
+def test_doubts_are_listed_where_there_are_any(tmp_path):
     good = {"detection": {"converged": True}, "noise": {"force_sd_ratio": 1.4, "position_sd_ratio": None}}
     bad = {"detection": {"converged": False}, "noise": {"force_sd_ratio": 12.04, "position_sd_ratio": 1.2}}
     assert doubts(good) == doubts({"detection": {}}) == []
@@ -245,13 +252,13 @@ def test_the_page_asks_nothing_of_the_network_and_stays_small(tmp_path):
 
 
 def test_an_estimator_without_uncertainty_has_a_page(tmp_path):
-    """NaN is 'not stated', in estimates and belief; the page's data are JSON, which has none."""
+    """NaN means unknown, in estimates and belief; the page's data are JSON, which has no NaN."""
     run = synthetic()
     none = np.full(len(run["sheet"].rest), np.nan)
     bare = [replace(estimate, sd=none, entropy=float("nan"), nis=float("nan")) for estimate in run["estimates"]]
     belief = Belief(mean=none, covariance=np.diag(none))
     page = write(tmp_path / "report.html", truth=True, images=False, estimates=bare, belief=belief)
-    assert "no stated deviation" in page
+    assert "no standard deviation" in page
 
 
 def test_the_same_run_gives_the_same_bytes(tmp_path):
@@ -302,18 +309,20 @@ def test_the_sentence_counts_patches_and_hits_by_hand():
     detection = Detection(
         attached=mask, score=mask.astype(float), stiffness=np.full(10, 0.8), stiffness_sd=np.full(10, 0.1), rule=""
     )
-    said = found(sheet, detection, plane_of(rest))
-    assert said.startswith("3 particles are reported attached, in 2 patches (2 around x = 5 mm, y = 5 mm; 1 around x =")
-    assert said.endswith("at 0.8 N/m each on average.")
+    sentence = found(sheet, detection, plane_of(rest))
+    assert sentence.startswith(
+        "3 particles are reported attached, in 2 patches (2 around x = 5 mm, y = 5 mm; 1 around x ="
+    )
+    assert sentence.endswith("at 0.8 N/m each on average.")
     attached = np.isin(np.arange(10), [0, 4, 5])
-    told = against_truth(sheet, detection, TransferredTruth(attached=attached, stiffness=attached * 1.0))
-    assert "In truth 3 are attached: 1 of them reported exactly, 1 within one mesh ring;" in told
-    assert told.endswith("1 of the 3 reports lies more than one ring off.")
+    compared = against_truth(sheet, detection, TransferredTruth(attached=attached, stiffness=attached * 1.0))
+    assert "In truth 3 are attached: 1 of them reported exactly, 1 within one mesh ring;" in compared
+    assert compared.endswith("1 of the 3 reports lies more than one ring off.")
     transferred = TransferredTruth(attached=mask, stiffness=mask * 1.5)
     belief = Belief(mean=np.full(10, 0.8), covariance=0.01 * np.eye(10) + 0.01)
     # A ring around 0, 1 and 9 is 0-3, 7-9: seven times 0.8; variance 7 * 0.01 + 49 * 0.01; truth 3 * 1.5.
     summed = stiffness_sums(sheet, belief, detection, transferred)
-    assert "sums to 5.6 N/m, with a stated standard deviation of 0.7; the truth is 4.5." in summed
+    assert "sums to 5.6 N/m, with a standard deviation of 0.7; the truth is 4.5." in summed
     welded = replace(transferred, stiffness=np.where(mask, np.inf, 0.0))
     assert stiffness_sums(sheet, belief, detection, welded) == ""
     nothing = TransferredTruth(attached=np.zeros(10, bool), stiffness=np.zeros(10))
@@ -384,9 +393,9 @@ def test_the_page_runs_in_chromium_without_a_console_error(tmp_path, truth, imag
     assert "WebGL is not supported" not in dom
 
 
-def test_the_synthetic_truth_is_carried_over_as_it_was_made():
-    """Guards the fixture: the two lines exist on both meshes, or every picture above would be of nothing."""
+def test_the_synthetic_truth_has_both_lines_on_both_meshes():
+    """Guard the fixture: without the two lines every picture above would show nothing."""
     run = synthetic()
-    transferred = carry(run["sheet"], run["truth"], 36)
+    transferred = transfer(run["sheet"], run["truth"], 36)
     assert 20 < transferred.attached.sum() < 80
     assert 550 < len(run["sheet"].rest) < 750

@@ -17,7 +17,7 @@ from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.planning.information_config import InformationPolicyConfig
 from jiggle_mj.estimator.planning.information_policy import InformationPolicy
 from jiggle_mj.estimator.planning.policy import STEP, Policy
-from jiggle_mj.eval.runs.acting import actions, check_goes_with, most_actions, policy_named
+from jiggle_mj.eval.runs.acting import actions, check_policy_fits, most_actions, policy_named
 from jiggle_mj.eval.runs.experiment import run_scene
 from jiggle_mj.limits import Limits
 from jiggle_mj.observation import Declaration
@@ -238,7 +238,7 @@ def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, mo
     assert keys(figures) == KEYS
     assert figures["policy"] == "pmp-up" and figures["ended"] == "all 3 steps are done"
     assert [one["does"][:7] for one in figures["decisions"]] == ["move to"] * 3
-    assert "What it did, and why" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Actions and reasons" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert figures["timing"]["plan_s"] > 0 and figures["safety"]["limit_n"] == 1e-5
     safety = figures["safety"]
     assert safety["force_violations"] > 0 and safety["max_force_n"] > 1e-5
@@ -329,7 +329,7 @@ def test_options_that_do_not_fit_are_refused(scene):
     policy = policy_named("detach", scene, seed=0)
     assert policy is not None
     with pytest.raises(OptionError, match="plan with the filter 'implicit'; got 'adam'"):
-        check_goes_with(policy, replace(EstimatorConfig(), filter="adam"))
+        check_policy_fits(policy, replace(EstimatorConfig(), filter="adam"))
 
 
 def test_every_policy_has_a_length(scene):

@@ -1,4 +1,4 @@
-"""Tables of runs: what is run again, what is not, and the Markdown by hand."""
+"""The main table: what is run again, what is not, and the Markdown by hand."""
 
 import json
 
@@ -7,8 +7,8 @@ import pytest
 
 from jiggle_mj.episode import settings
 from jiggle_mj.estimator import EstimatorConfig
-from jiggle_mj.eval.studies import main_table as tables
-from jiggle_mj.eval.studies.main_table import MAIN, MainRow, markdown, measure
+from jiggle_mj.eval.studies.main_table import MAIN, MainCell, MainRow, MainStudy
+from jiggle_mj.eval.studies.study import run_study
 from jiggle_mj.recording.estimate import EstimateWriter
 from tests.support.scored_run import SHEET, scored, unscored, written
 
@@ -16,9 +16,14 @@ ROW = MainRow(scene="arc", sensing="particles")
 
 
 @pytest.fixture
-def runs(monkeypatch):
-    """Folders that were run, instead of minutes of MuJoCo."""
-    folders = []
+def ran():
+    """Names of the folders that were run."""
+    return []
+
+
+@pytest.fixture
+def study(ran):
+    """The study of one row, which writes folders instead of minutes of MuJoCo."""
 
     def run_scene(_scene, folder, *, seed, sensing, overwrite):
         assert sensing == "particles" and overwrite
@@ -28,31 +33,30 @@ def runs(monkeypatch):
         written(folder, settings(EstimatorConfig()))
         figures = scored() | {"seed": seed}
         (folder / "result.json").write_text(json.dumps(figures))
-        folders.append(folder.name)
+        ran.append(folder.name)
         return figures
 
-    monkeypatch.setattr(tables, "run_scene", run_scene)
-    return folders
+    return MainStudy(rows=(ROW,), run_scene=run_scene)
 
 
-def test_a_table_goes_on_where_it_stopped(runs, tmp_path):
-    told = []
-    measure([ROW], (0,), tmp_path, log=told.append)
-    found = measure([ROW], (0, 1), tmp_path, log=told.append)
-    assert runs == ["arc-particles-0", "arc-particles-1"]
-    assert told == ["arc, particles, seed 0", "arc, particles, seed 1"]
-    assert [figures["seed"] for figures in found[ROW]] == [0, 1]
+def test_a_table_goes_on_where_it_stopped(study, ran, tmp_path):
+    lines = []
+    run_study(study, study.cells((0,)), tmp_path, log=lines.append)
+    results = run_study(study, study.cells((0, 1)), tmp_path, log=lines.append)
+    assert ran == ["arc-particles-0", "arc-particles-1"]
+    assert lines == ["1 of 1: arc-particles-0", "1 of 1: arc-particles-1"]
+    assert [figures["seed"] for figures in results.values()] == [0, 1]
 
 
-def test_a_run_that_was_not_scored_or_had_other_settings_is_made_again(runs, tmp_path):
-    measure([ROW], (0, 1), tmp_path, log=lambda _: None)
+def test_a_run_that_was_not_scored_or_had_other_settings_is_made_again(study, ran, tmp_path):
+    run_study(study, study.cells((0, 1)), tmp_path)
     (tmp_path / "arc-particles-0" / "result.json").write_text(json.dumps(unscored()))
     other = tmp_path / "arc-particles-1"
     (other / "estimate.mcap").unlink()
     with EstimateWriter(other / "estimate.mcap", SHEET, settings(EstimatorConfig(detect_above=0.5))):
         pass
-    measure([ROW], (0, 1), tmp_path, log=lambda _: None)
-    assert runs == ["arc-particles-0", "arc-particles-1"] * 2
+    run_study(study, study.cells((0, 1)), tmp_path)
+    assert ran == ["arc-particles-0", "arc-particles-1"] * 2
 
 
 def test_means_and_ranges_by_hand():
@@ -61,8 +65,8 @@ def test_means_and_ranges_by_hand():
     two["detection"]["by_dilation"]["0"]["pcd"] = 1.0
     for figures in (one, two):
         figures["calibration"]["nees_attached"] = None
-    cells = [cell.strip() for cell in markdown({ROW: [one, two]}).splitlines()[2].split("|")[1:-1]]
-    headings = [cell.strip() for cell in markdown({}).splitlines()[0].split("|")[1:-1]]
+    text = MainStudy().to_markdown({MainCell(row=ROW, seed=seed): run for seed, run in enumerate((one, two))})
+    headings, _, cells = ([cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines())
     found = dict(zip(headings, cells, strict=True))
     assert (found["scene"], found["attached"], found["PCD % exact"]) == ("arc", "2", "75.0 (50.0…100.0)")
     assert (found["NEES/dof attached"], found["update s"]) == ("\N{EN DASH}", f"{np.mean([0.2, 0.2]):.2f}")

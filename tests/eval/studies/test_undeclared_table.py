@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from jiggle_mj.cli.options import RowsName
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.eval.runs.closing_the_loop import DISCREPANCY
-from jiggle_mj.eval.studies import undeclared_table
+from jiggle_mj.eval.studies.study import run_study
 from jiggle_mj.eval.studies.undeclared_panel import (
     GROUPS,
     MOVING,
@@ -23,7 +24,7 @@ from jiggle_mj.eval.studies.undeclared_panel import (
     TOGETHER,
     scene_with,
 )
-from jiggle_mj.eval.studies.undeclared_table import markdown, measure
+from jiggle_mj.eval.studies.undeclared_table import UndeclaredCell, UndeclaredStudy
 from jiggle_mj.recording.declaration import VERSION, file_metadata
 from jiggle_mj.scenes import load_scene
 
@@ -36,7 +37,7 @@ def found(
     theta: Sequence[float] = (0.1, 0.2),
     sd: Sequence[float] = (0.01, 0.02),
 ) -> dict:
-    """A run that was foretold to 2 mm before."""
+    """Return the content of discrepancy.json for a held-out error of 2 mm before."""
     detection = {"by_dilation": {"1": {"pug": 0.5}}}
     return {
         "verdict": verdict,
@@ -65,7 +66,7 @@ def test_attachments_are_as_shipped_on_a_mesh_as_fine_as_there_and_wider_and_sti
     assert len(scene_with("nothing, U shape", 0).attachments) == 3
 
 
-def test_rows_are_told_apart_by_name():
+def test_every_row_has_a_name_of_its_own():
     assert len(ROWS) == sum(len(rows) for rows in GROUPS.values())
     assert set(get_args(RowsName)) == set(GROUPS)
 
@@ -94,6 +95,11 @@ def test_noise_is_as_strong_in_every_row():
     assert sd == pytest.approx([sd[0]] * len(sd))
 
 
+def by_cell(runs: dict[tuple[str, int], dict]) -> dict[UndeclaredCell, dict]:
+    """Return runs by cell, from runs by row and seed."""
+    return {UndeclaredCell(row=row, seed=seed): run for (row, seed), run in runs.items()}
+
+
 def test_counts():
     runs = {
         ("friction", 0): found("effect", "friction"),
@@ -108,7 +114,7 @@ def test_counts():
         ("nothing", 0): found("no-effect", after=2e-3),
         ("nothing, images", 0): found("effect", "gravity"),
     }
-    lines = markdown(runs).splitlines()
+    lines = UndeclaredStudy().to_markdown(by_cell(runs)).splitlines()
     assert lines[2] == (
         "| friction | friction (1); gravity, friction (1) | effect (1); ambiguous (1) | 0.1 (0.01), 0.2 (0.02); "
         "0.1 (0.01), 0.2 (0.02) | 2.00 → 1.00; 2.00 → 1.00 | 0.50 → 0.50; 0.50 → 0.50 |"
@@ -126,35 +132,37 @@ def test_counts():
 
 
 def test_sizes_lie_within_their_intervals_or_do_not():
-    """Of two lifts of a lowered bed: two of three parameters, and one of three; friction has no true size."""
+    """Two runs with a lowered bed: two of three parameters, and one of three; friction has no true size."""
     runs = {
         ("bed lower", 0): found("effect", "bed", theta=[-0.0031, 0.001, 0.003], sd=[1e-4, 1e-3, 1e-3]),
         ("bed lower", 1): found("effect", "bed", theta=[-0.0033, 0.003, 0.0], sd=[1e-4, 1e-3, 1e-3]),
         ("friction", 0): found("effect", "friction", theta=[0.4], sd=[0.01]),
     }
-    assert markdown(runs).endswith("3 of 6 parameters within their 95 % interval.")
+    assert UndeclaredStudy().to_markdown(by_cell(runs)).endswith("3 of 6 parameters within their 95 % interval.")
 
 
 @pytest.mark.parametrize(("version", "times"), [(file_metadata()[VERSION], 1), ("0.0", 2)])
-def test_what_this_version_ran_is_not_run_again(tmp_path, monkeypatch, version, times):
+def test_what_this_version_ran_is_not_run_again(tmp_path, version, times):
     ran = []
 
-    def run(name, seed, folder):
-        ran.append((name, seed))
-        folder.mkdir(exist_ok=True)
-        (folder / DISCREPANCY).write_text(json.dumps({VERSION: version} | found("no-effect")))
+    class Counted(UndeclaredStudy):
+        def run_cell(self, cell: UndeclaredCell, path: Path) -> None:
+            ran.append((cell.row, cell.seed))
+            path.mkdir(exist_ok=True)
+            (path / DISCREPANCY).write_text(json.dumps({VERSION: version} | found("no-effect")))
 
-    monkeypatch.setattr(undeclared_table, "_run", run)
+    study = Counted(rows=("tool scale",))
     with ThreadPoolExecutor(1) as executor:
-        runs = [measure(["tool scale"], [0, 1], tmp_path, executor=executor, log=lambda _: None) for _ in range(2)]
+        runs = [run_study(study, study.cells((0, 1)), tmp_path, executor=executor) for _ in range(2)]
     both = [("tool scale", 0), ("tool scale", 1)]
     assert ran == times * both
-    assert [list(one) for one in runs] == [both, both]
+    assert [[(cell.row, cell.seed) for cell in results] for results in runs] == [both, both]
 
 
 @pytest.mark.slow
 def test_an_undeclared_tool_scale_is_named_across_engines(tmp_path):
-    undeclared_table._run("tool scale", 0, tmp_path / "run")
-    closed = json.loads((tmp_path / "run" / DISCREPANCY).read_text())
-    assert [one["name"] for one in closed["effects"]] == ["tool_scale"]
+    study, cell = UndeclaredStudy(), UndeclaredCell(row="tool scale", seed=0)
+    study.run_cell(cell, tmp_path / "run")
+    closed = study.read(cell, tmp_path / "run")
+    assert [effect["name"] for effect in closed["effects"]] == ["tool_scale"]
     assert closed["held_out"]["after_rms_m"] < closed["held_out"]["before_rms_m"]
