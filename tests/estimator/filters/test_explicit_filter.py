@@ -73,16 +73,16 @@ def test_an_update_is_the_papers_equations(lift):
 
     mean, covariance = (np.asarray(part) for part in belief.moments())
     simulate = jax.jit(lambda b: predicted_stack(three, b).ravel())
-    h = 1e-5
+    h, tolerance = 1e-5, 1e-4  # of the central differences, whose error comes with J into every figure
     J = np.stack([(simulate(mean + h * d) - simulate(mean - h * d)) / (2 * h) for d in np.eye(MESH.n)], axis=1)
     S = J @ covariance @ J.T + NOISE**2 * np.eye(len(J))
     K = covariance @ J.T @ np.linalg.inv(S)
     innovation = np.asarray(three.end).ravel() - np.asarray(simulate(mean))
     expected_mean = mean + K @ innovation
     expected_covariance = (np.eye(MESH.n) - K @ J) @ covariance
-    np.testing.assert_allclose(found_mean, expected_mean, atol=1e-4)
-    np.testing.assert_allclose(found_covariance, expected_covariance, atol=1e-4)
-    np.testing.assert_allclose(nis, innovation @ np.linalg.solve(S, innovation) / len(S), rtol=1e-4)
+    np.testing.assert_allclose(found_mean, expected_mean, atol=tolerance)
+    np.testing.assert_allclose(found_covariance, expected_covariance, atol=tolerance)
+    np.testing.assert_allclose(nis, innovation @ np.linalg.solve(S, innovation) / len(S), rtol=tolerance)
 
 
 def predicted_stack(samples: Shots, b) -> jax.Array:
@@ -95,7 +95,7 @@ def test_a_missing_particle_has_no_influence(lift):
     one = eqx.tree_at(lambda s: s.precision, lift[3], unseen)
     other = eqx.tree_at(lambda s: s.end, one, one.end.at[0, 7].add(0.3))
     np.testing.assert_array_equal(updated(belief, one).precision, updated(belief, other).precision)
-    np.testing.assert_allclose(updated(belief, one).shift, updated(belief, other).shift, rtol=1e-12)
+    np.testing.assert_allclose(updated(belief, one).shift, updated(belief, other).shift, rtol=1e-12)  # rounding
 
 
 def filtered(samples: list[Shots]) -> tuple[BoundaryBelief, np.ndarray]:
@@ -119,7 +119,7 @@ def test_what_is_seen_is_evidence_for_the_b_that_was_simulated(lift):
     agreeing = eqx.tree_at(lambda shot: shot.end, lift[3], predicted_stack(lift[3], nothing))
     after = updated(belief, agreeing, nothing)
     assert np.diagonal(after.precision).max() > 2
-    np.testing.assert_allclose(after.shift, belief.shift, atol=1e-9 * float(after.precision.max()))
+    np.testing.assert_allclose(after.shift, belief.shift, atol=1e-9 * float(after.precision.max()))  # rounding
 
 
 def test_the_latest_sample_is_always_drawn_and_none_from_before_the_cut():

@@ -38,7 +38,10 @@ def drawn() -> list[ForceResiduals]:
 
 
 def test_squares_equal_the_degrees_of_freedom_where_the_noise_is_right(drawn):
-    """For forces and positions separately, over single frames and over their sum; the bars are four standard errors."""
+    """For forces and positions separately, over single frames and over their sum.
+
+    The bar of the mean is four standard errors. One sum has the scatter of a single frame, and the same bar of 0.3.
+    """
     for name in ("force", "position"):
         ratio = [float(jnp.sum(getattr(one, name) ** 2) / getattr(one, f"{name}_degrees")) for one in drawn]
         assert np.mean(ratio) == pytest.approx(1, abs=4 * np.std(ratio) / np.sqrt(DRAWS)), name
