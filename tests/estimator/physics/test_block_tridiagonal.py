@@ -19,11 +19,13 @@ from jiggle_mj.estimator.physics.mesh import pattern
 from tests.support.small_sheet import dense
 
 ROUNDING = 1e-11
-"""Relative; condition numbers stay below 1e3 here, so 1e3 roundings of 1e-16, with room for sums of 60 terms."""
+"""Relative; condition numbers are below 1e3 here: 1e3 roundings of 1e-16, and sums of 60 terms."""
+SINGLE_RELATIVE, SINGLE_ABSOLUTE = 1e-5, 1e-6
+"""For float32, whose rounding is 6e-8, at entries of up to 1."""
 
 
 def chain(n: int, reach: int, seed: int) -> np.ndarray:
-    """Random elements of three particles, no further apart than `reach` in a hidden order."""
+    """Return random elements of three particles, no further apart than `reach` in a hidden order."""
     generator = np.random.default_rng(seed)
     order = generator.permutation(n)
     start = np.arange(n - reach)
@@ -33,7 +35,7 @@ def chain(n: int, reach: int, seed: int) -> np.ndarray:
 
 @pytest.fixture(scope="module", params=[(17, 2, 0), (17, 5, 1), (5, 3, 2)], ids=["padded", "three blocks", "one block"])
 def system(request):
-    """A positive definite matrix, its layout and its dense form assembled by hand."""
+    """Return a positive definite matrix, its layout and its dense form assembled by hand."""
     n, reach, seed = request.param
     generator = np.random.default_rng(seed)
     elements = chain(n, reach, seed)
@@ -89,13 +91,13 @@ def test_the_inverses_blocks_equal_numpys_to_single_precision(system):
     inverse[padding, :, padding, :] = np.eye(3)
     blocks = inverse.reshape(nb, m, nb, m)
     for k in range(nb):
-        np.testing.assert_allclose(band.diagonal[k], blocks[k, :, k], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(band.diagonal[k], blocks[k, :, k], rtol=SINGLE_RELATIVE, atol=SINGLE_ABSOLUTE)
     for k in range(nb - 1):
-        np.testing.assert_allclose(band.lower[k], blocks[k + 1, :, k], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(band.lower[k], blocks[k + 1, :, k], rtol=SINGLE_RELATIVE, atol=SINGLE_ABSOLUTE)
 
 
 def test_the_square_of_a_banded_right_hand_side_equals_the_dense_product(system):
-    """B^T A^-1 B, every third column of A as B; the sums left out are those of zeros."""
+    """B^T A^-1 B, with every third column of A as B; the omitted sums are zero."""
     layout, matrix, by_hand = system
     n, padded = len(by_hand) // 3, layout.n_blocks * layout.width
     columns = by_hand[:, ::3]
@@ -116,7 +118,7 @@ def test_an_indefinite_matrix_gives_nan_and_no_number(system):
 
 
 def test_an_absent_vertex_of_an_element_adds_nothing():
-    """-1 stands for 'none': its windows fall off, the others stay."""
+    """-1 means 'none': its windows are dropped, the others stay."""
     layout = Layout.from_pattern(pattern(4, np.array([[0, 1], [1, 2], [2, 3]])))
     windows = jnp.ones((1, 2, 3, 2, 3))
     matrix = assemble(layout, [(jnp.asarray(layout.pair_index(np.array([[1, -1]]))), windows)])
@@ -132,7 +134,7 @@ def test_a_pair_outside_the_band_is_refused():
 
 
 def test_positions_narrow_the_band_of_a_square_sheet():
-    """Along a side of a 12 x 12 lattice the band is its diagonal, 13; levels around a corner are wider."""
+    """Along a side of a 12 x 12 lattice the band is its diagonal, 13; Cuthill-McKee's levels at a corner are wider."""
     i, j = np.divmod(np.arange(144), 12)
     steps = [(i < 11, 12), (j < 11, 1), ((i < 11) & (j < 11), 13), ((i < 11) & (j > 0), 11)]
     pairs = np.concatenate([np.column_stack([np.flatnonzero(has), np.flatnonzero(has) + by]) for has, by in steps])

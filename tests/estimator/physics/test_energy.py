@@ -20,10 +20,15 @@ from tests.support.small_sheet import DECLARATION, dense, equilateral, jittered
 K, NU, PLATE = 30.0, 0.45, 3e-6
 """Membrane stiffness [N/m], Poisson's ratio, bending stiffness [N m]."""
 ROUNDING = 1e-10
-"""Of derivatives written out against autodiff, relative to their largest entry."""
+"""Relative to the largest entry, for derivatives written out against autodiff."""
 DIFFERENCE = 1e-6
-"""Of central differences with a step of 1e-6 m, relative to the largest entry: the truncation is h^2 / 6 times a fourth
-derivative of about K / (1 mm)^2, so 2e-7 of K."""
+"""Relative to the largest entry, for central differences with a step of 1e-6 m: the truncation is h^2 / 6 times a
+fourth derivative of about K / (1 mm)^2, so 2e-7 of K."""
+SMALLEST_SCALE = 1e-3
+"""Largest entry below which errors are absolute: where energies or forces vanish."""
+JITTER_ERROR = 0.05
+"""Relative error of the bending energy on a jittered mesh: 4 % at any resolution, as hinge weights are exact for
+regular triangles alone."""
 MESH = jittered(equilateral(4, 4), 0.15)
 ROUGH = dataclasses.replace(MESH, rest=MESH.rest + np.random.default_rng(8).normal(size=MESH.rest.shape) * 2e-4)
 TIP = MESH.rest[5] + np.array([1e-3, 0.0, 1e-3])
@@ -76,22 +81,23 @@ def states() -> dict[str, np.ndarray]:
 CASES = [(name, state) for name in terms() for state in states()]
 
 
-def error(found, expected) -> float:
-    """Largest difference, relative to the largest entry."""
-    return float(np.max(np.abs(np.asarray(found) - np.asarray(expected))) / max(float(np.max(np.abs(expected))), 1e-3))
+def error(actual, expected) -> float:
+    """Return the largest difference, relative to the largest entry."""
+    scale = max(float(np.max(np.abs(expected))), SMALLEST_SCALE)
+    return float(np.max(np.abs(np.asarray(actual) - np.asarray(expected))) / scale)
 
 
 @pytest.fixture(scope="module")
 def derivatives():
-    """Each term's functions, compiled once for all states."""
+    """Return each term's functions, compiled once for all states."""
 
     def compiled(term: Term):
         total = lambda y: jnp.sum(term.energy(y))  # noqa: E731
         m = len(term.vertices)
 
         def curvature(y):
-            whole = jax.jacfwd(jax.grad(total))(y)
-            return whole[jnp.arange(m), :, :, jnp.arange(m)]
+            hessian = jax.jacfwd(jax.grad(total))(y)
+            return hessian[jnp.arange(m), :, :, jnp.arange(m)]
 
         names = ("energy", "gradient", "hessian", "positive_hessian")
         energy, *rest = (jax.jit(lambda y, name=name: getattr(term, name)(y)) for name in names)
@@ -125,7 +131,7 @@ def test_positive_hessian_has_no_negative_eigenvalue(derivatives, name, state):
     x = jnp.asarray(states()[state])[term.vertices]
     size = 3 * x.shape[1]
     values = np.linalg.eigvalsh(np.asarray(positive(x)).reshape(-1, size, size))
-    assert values.min() > -ROUNDING * max(float(np.abs(values).max()), 1e-3)
+    assert values.min() > -ROUNDING * max(float(np.abs(values).max()), SMALLEST_SCALE)
 
 
 @pytest.mark.parametrize("name", ["triangles", "edges", "grip"])
@@ -142,8 +148,8 @@ def test_a_particle_at_the_tip_gives_finite_forces_and_a_solvable_newton_step(le
     """At |x - u| = 0 the direction of the spring is undefined; nothing may become NaN there."""
     grip = Grip(vertices=np.array([[0]]), tip=jnp.zeros(3), length=jnp.array([length]), stiffness=jnp.array([100.0]))
     x = jnp.zeros((1, 1, 3))
-    for found in (grip.energy(x), grip.gradient(x), grip.hessian(x), grip.positive_hessian(x)):
-        assert np.isfinite(np.asarray(found)).all()
+    for value in (grip.energy(x), grip.gradient(x), grip.hessian(x), grip.positive_hessian(x)):
+        assert np.isfinite(np.asarray(value)).all()
     np.testing.assert_array_equal(grip.gradient(x), 0)
 
 
@@ -151,8 +157,8 @@ def test_a_slack_spring_that_closed_on_the_particle_itself_pulls_it_back_from_ev
     """With r = 0 the energy is k/2 |x - u|^2, whose Hessian is k I at the tip too."""
     grip = Grip(vertices=np.array([[0]]), tip=jnp.zeros(3), length=jnp.array([0.0]), stiffness=jnp.array([100.0]))
     for x in (jnp.zeros((1, 1, 3)), jnp.array([[[1e-3, -2e-3, 0.0]]])):
-        np.testing.assert_allclose(grip.hessian(x)[0, 0, :, 0], 100 * np.eye(3), atol=1e-9)
-        np.testing.assert_allclose(grip.positive_hessian(x)[0, 0, :, 0], 100 * np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(grip.hessian(x)[0, 0, :, 0], 100 * np.eye(3), atol=100 * ROUNDING)
+        np.testing.assert_allclose(grip.positive_hessian(x)[0, 0, :, 0], 100 * np.eye(3), atol=100 * ROUNDING)
 
 
 @pytest.mark.parametrize("name", ["triangles", "edges", "bending", "bending of a rough sheet"])
@@ -160,15 +166,16 @@ def test_a_slack_spring_that_closed_on_the_particle_itself_pulls_it_back_from_ev
 def test_rigid_motion_stores_no_energy_and_makes_no_force(derivatives, name, seed):
     """U(R x + t) = U(x), and from rest its gradient is zero; against a 1 mm bump of the same sheet."""
     term, energy, _, _, gradient, _, _ = derivatives[name]
-    turn = Rotation.random(rng=np.random.default_rng(seed))
+    rotation = Rotation.random(rng=np.random.default_rng(seed))
     shift = np.random.default_rng(seed).normal(size=3)
     rest = (ROUGH if "rough" in name else MESH).rest
     bumped = rest + np.column_stack([0 * rest[:, :2], 1e-3 * np.cos(200 * rest[:, 1])])
     scale = float(jnp.sum(energy(jnp.asarray(bumped)[term.vertices])))
-    moved = jnp.asarray(turn.apply(bumped) + shift)
-    # Positions near 1 m carry 1e-16 m of rounding against edges of 7 mm: strains of 1e-13 against 1e-2.
+    moved = jnp.asarray(rotation.apply(bumped) + shift)
+    # Positions near 1 m have 1e-16 m of rounding, edges are 7 mm long: strains of 1e-13 against 1e-2.
     assert float(jnp.sum(energy(moved[term.vertices]))) == pytest.approx(scale, rel=1e-9)
-    at_rest = jnp.asarray(turn.apply(rest) + shift)[term.vertices]
+    at_rest = jnp.asarray(rotation.apply(rest) + shift)[term.vertices]
+    # The same strains squared, and times K and an edge's length.
     assert float(jnp.sum(energy(at_rest))) < 1e-12 * scale
     assert float(jnp.max(jnp.abs(gradient(at_rest)))) < 1e-8
 
@@ -186,16 +193,16 @@ def test_a_triangle_membrane_in_uniaxial_tension_has_the_typed_modulus_and_poiss
         return float(jnp.sum(term.energy(x[term.vertices]))) / mesh.face_area.sum()
 
     strain = 0.04
-    assert density(strain, -NU * strain) == pytest.approx(K * strain**2 / 2, rel=1e-10)
+    assert density(strain, -NU * strain) == pytest.approx(K * strain**2 / 2, rel=ROUNDING)
     # The energy is quadratic in E, so symmetric about its minimum.
-    assert density(strain, -NU * strain + 0.01) == pytest.approx(density(strain, -NU * strain - 0.01), rel=1e-10)
+    assert density(strain, -NU * strain + 0.01) == pytest.approx(density(strain, -NU * strain - 0.01), rel=ROUNDING)
     assert density(strain, -NU * strain + 0.01) > density(strain, -NU * strain)
 
 
 def test_axis_1_of_a_membrane_is_the_worlds_x_where_the_sheet_is_not_edge_on_to_it():
     """A stretch along x is E_11 in a level sheet; in one across x, the stretch along y is."""
-    for turn, stretch in (("z", [1.2, 1, 1]), ("y", [1, 1.2, 1])):
-        mesh = dataclasses.replace(MESH, rest=Rotation.from_euler(turn, 90, degrees=True).apply(MESH.rest))
+    for axis, stretch in (("z", [1.2, 1, 1]), ("y", [1, 1.2, 1])):
+        mesh = dataclasses.replace(MESH, rest=Rotation.from_euler(axis, 90, degrees=True).apply(MESH.rest))
         term = TriangleMembrane.build(mesh, stiffness=K, poisson=NU)
         strain = term.strain(jnp.asarray(mesh.rest * stretch)[term.vertices])
         np.testing.assert_allclose(strain, np.tile([0.5 * (1.2**2 - 1), 0, 0], (len(mesh.faces), 1)), atol=1e-12)
@@ -221,12 +228,12 @@ def test_edge_springs_on_equilateral_triangles_have_modulus_k_and_poissons_ratio
 
 @pytest.mark.parametrize(
     ("jitter", "tolerance"),
-    [(0.0, 0.03), (0.15, 0.12)],
+    [(0.0, ROUNDING), (0.15, JITTER_ERROR)],
     ids=["equilateral", "jittered"],
 )
 @pytest.mark.parametrize("angle", [0.0, 0.5, np.pi / 2])
 def test_a_sheet_bent_to_a_cylinder_stores_half_b_c_squared_per_area(jitter, tolerance, angle):
-    """Plate theory: B c^2 / 2. Counted over inner triangles, half of each of their three hinges."""
+    """Plate theory: B c^2 / 2. Summed over inner triangles, with half of each of their three hinges."""
     mesh = jittered(equilateral(16, 16, 3e-3), jitter)
     term = IsometricBending.build(mesh, stiffness=PLATE)
     c = 5.0
@@ -250,8 +257,8 @@ def test_the_bed_only_pushes():
     np.testing.assert_allclose(bed.gradient(below)[:, 0, 2], -10.0 * 3e-4, rtol=1e-9)
 
 
-def test_the_bed_carries_the_sheet_where_it_lay():
-    """Also with gravity aslant and where particles stand for different areas."""
+def test_the_bed_supports_the_sheet_in_its_rest_shape():
+    """The same holds for oblique gravity and for particles of different areas."""
     energy = surrogate(MESH, dataclasses.replace(DECLARATION, gravity=(1.0, -2.0, -9.0)))
     np.testing.assert_allclose(energy.internal_gradient(jnp.asarray(MESH.rest)), 0, atol=1e-12)
 
@@ -269,14 +276,14 @@ def test_the_assembled_derivatives_are_those_of_the_whole_energy():
     x = jnp.asarray(states()["lifted"])
     gradient, hessian = eqx.filter_jit(energy.gradient), eqx.filter_jit(energy.hessian)
     np.testing.assert_allclose(gradient(x, b), jax.jit(jax.grad(energy.value))(x, b), rtol=1e-9, atol=1e-12)
-    whole = jax.jit(jax.hessian(energy.value))(x, b).reshape(3 * MESH.n, 3 * MESH.n)
-    assert error(dense(energy.layout, hessian(x, b)), whole) < ROUNDING
-    assert np.linalg.eigvalsh(dense(energy.layout, hessian(x, b, positive=True))).min() > -1e-9 * K
+    expected = jax.jit(jax.hessian(energy.value))(x, b).reshape(3 * MESH.n, 3 * MESH.n)
+    assert error(dense(energy.layout, hessian(x, b)), expected) < ROUNDING
+    assert np.linalg.eigvalsh(dense(energy.layout, hessian(x, b, positive=True))).min() > -10 * ROUNDING * K
 
 
 @pytest.mark.parametrize("membrane", ["triangles", "edges"])
 def test_scaling_every_stiffness_and_weight_scales_the_energy(membrane):
-    """Gauge: U(x; s b, s k, s rho) = s U(x; b, k, rho), so positions tell ratios only."""
+    """Gauge: U(x; s b, s k, s rho) = s U(x; b, k, rho), so positions identify ratios only."""
     scale = 7.0
     scaled = dataclasses.replace(
         DECLARATION,
@@ -285,5 +292,5 @@ def test_scaling_every_stiffness_and_weight_scales_the_energy(membrane):
     )
     b = jnp.full(MESH.n, 0.5)
     x = jnp.asarray(states()["pressed into the bed"])
-    one, other = (surrogate(MESH, declared, membrane=membrane) for declared in (DECLARATION, scaled))
-    assert float(other.value(x, scale * b)) == pytest.approx(scale * float(one.value(x, b)), rel=1e-12)
+    soft, stiff = (surrogate(MESH, declared, membrane=membrane) for declared in (DECLARATION, scaled))
+    assert float(stiff.value(x, scale * b)) == pytest.approx(scale * float(soft.value(x, b)), rel=1e-12)

@@ -27,20 +27,23 @@ from tests.support.small_sheet import (
     sheet_energy,
 )
 
-SAME_PLACE = 3e-7
-"""[m]: a force tolerance of 1e-8 N over the stiffness of bending, 3e-6 N m / (7 mm)^2 = 0.06 N/m, twice."""
+SAME_POSITION = 3e-7
+"""Distance of two converged states [m]: twice the force tolerance of 1e-8 N over the stiffness of bending,
+3e-6 N m / (7 mm)^2 = 0.06 N/m."""
+TIGHT_FORCE = 1e-11
+"""Force tolerance for states that are differentiated numerically [N]."""
 
 
 @pytest.fixture(scope="module")
 def lifted():
-    """A grasped and lifted corner of the shared sheet, and its equilibrium."""
+    """Return the shared sheet with a lifted corner, its attachments, and its equilibrium."""
     corner = corners()[0]
     energy = gripped(sheet_energy(), sheet().rest, corner, corner + np.array([2e-3, 2e-3, 0.012]))
     b = jnp.asarray(STIFFNESS * attached())
     return energy, b, search(energy, b, jnp.asarray(sheet().rest))
 
 
-def test_forces_balance_to_the_stated_tolerance(lifted):
+def test_forces_balance_to_the_tolerance(lifted):
     energy, b, found = lifted
     assert bool(found.converged) and int(found.steps) > 1
     force = float(jnp.max(jnp.abs(jax.grad(energy.value)(found.x, b))))
@@ -48,7 +51,7 @@ def test_forces_balance_to_the_stated_tolerance(lifted):
     assert float(found.force) == pytest.approx(force, abs=1e-12)
 
 
-def test_the_held_corner_follows_the_tip_and_the_attached_middle_lags(lifted):
+def test_the_held_corner_moves_with_the_tip_and_the_attached_middle_lags(lifted):
     energy, _, found = lifted
     moved = np.linalg.norm(np.asarray(found.x) - sheet().rest, axis=1)
     held = np.asarray(energy.terms[-1].stiffness) > 0
@@ -61,7 +64,7 @@ def test_the_end_does_not_depend_on_the_start(lifted):
     for shift in (1e-3 * draw.normal(size=sheet().rest.shape), np.array([0.0, 0.0, 0.01])):
         other = search(energy, b, jnp.asarray(sheet().rest + shift))
         assert bool(other.converged)
-        np.testing.assert_allclose(other.x, found.x, atol=SAME_PLACE)
+        np.testing.assert_allclose(other.x, found.x, atol=SAME_POSITION)
 
 
 def test_a_search_cut_short_says_that_it_has_not_converged(lifted):
@@ -73,21 +76,21 @@ def test_a_search_cut_short_says_that_it_has_not_converged(lifted):
 
 
 def test_a_step_that_single_precision_cannot_solve_is_solved_in_double():
-    """A sheet that floats but for 1e-7 N/m a particle, against membrane edges of 30 N/m."""
+    """A sheet that floats except for 1e-7 N/m per particle, against membrane edges of 30 N/m."""
     energy, b = surrogate(sheet(), Declaration(gravity=(0.0, 0.0, 0.0), bed=False)), jnp.full(sheet().n, 1e-7)
     x = jnp.asarray(sheet().rest) + jnp.array([[0.0, 0.0, 5e-3]])
     matrix, gradient = energy.hessian(x, b, positive=True), energy.gradient(x, b)
 
-    def left(step):
+    def residual(step):
         return float(jnp.linalg.norm(multiply(energy.layout, matrix, step) + gradient) / jnp.linalg.norm(gradient))
 
-    rough = jax.tree.map(lambda part: part.astype(jnp.float32), (matrix, gradient))
-    assert not left(-solve(energy.layout, cholesky(rough[0]), rough[1]).astype(float)) < MAX_LINEAR_RESIDUAL
-    assert left(newton_step(energy.layout, matrix, gradient)) < 1e-3 * MAX_LINEAR_RESIDUAL
+    single = jax.tree.map(lambda part: part.astype(jnp.float32), (matrix, gradient))
+    assert not residual(-solve(energy.layout, cholesky(single[0]), single[1]).astype(float)) < MAX_LINEAR_RESIDUAL
+    assert residual(newton_step(energy.layout, matrix, gradient)) < 1e-3 * MAX_LINEAR_RESIDUAL
 
 
 def test_scipy_finds_the_same_minimum():
-    """Newton-CG-free check: trust-exact with the dense Hessian by autodiff, on a sheet of 16 particles."""
+    """An independent method: trust-exact with the dense Hessian by autodiff, on a sheet of 16 particles."""
     mesh = equilateral(4, 4)
     energy = surrogate(mesh, DECLARATION)
     corner = mesh.rest[0] + 1e-3
@@ -101,7 +104,7 @@ def test_scipy_finds_the_same_minimum():
     )
     ours = search(energy, b, jnp.asarray(mesh.rest))
     assert theirs.success and bool(ours.converged)
-    np.testing.assert_allclose(np.ravel(ours.x), theirs.x, atol=SAME_PLACE)
+    np.testing.assert_allclose(np.ravel(ours.x), theirs.x, atol=SAME_POSITION)
 
 
 def test_scaling_every_stiffness_and_weight_moves_nothing(lifted):
@@ -117,30 +120,30 @@ def test_scaling_every_stiffness_and_weight_moves_nothing(lifted):
     scaled = eqx.tree_at(lambda e: e.terms, energy, (*surrogate(sheet(), declared).terms, grip))
     other = search(scaled, scale * b, jnp.asarray(sheet().rest), force_tolerance=scale * FORCE_TOLERANCE)
     assert bool(other.converged)
-    np.testing.assert_allclose(other.x, found.x, atol=SAME_PLACE)
+    np.testing.assert_allclose(other.x, found.x, atol=SAME_POSITION)
 
 
-def place(energy, b, tip, start):
-    """Equilibrium as a function of b and the tip."""
+def equilibrium_of(energy, b, tip, start):
+    """Return the equilibrium as a function of b and the tip."""
     energy = eqx.tree_at(lambda e: e.terms[-1].tip, energy, tip)
-    return equilibrium(energy, b, start, force_tolerance=1e-11).x
+    return equilibrium(energy, b, start, force_tolerance=TIGHT_FORCE).x
 
 
 def test_implicit_derivatives_in_b_and_tip_equal_finite_differences_forward_and_reverse(lifted):
-    """dx/db = -H^-1 blkdiag(x - a) and dx/du alike; central differences of converged equilibria, along random ways."""
+    """dx/db = -H^-1 blkdiag(x - a) and dx/du in the same form; central differences along random directions."""
     energy, b, found = lifted
     draw = np.random.default_rng(1)
     b = b + 0.2
     tip = energy.terms[-1].tip
     move_b, move_tip = jnp.asarray(draw.normal(size=len(b))), jnp.asarray(draw.normal(size=3) * 1e-3)
     out = jnp.asarray(draw.normal(size=found.x.shape))
-    start = search(energy, b, found.x, force_tolerance=1e-11).x
+    start = search(energy, b, found.x, force_tolerance=TIGHT_FORCE).x
 
-    f = jax.jit(lambda b, tip: place(energy, b, tip, start))
+    f = jax.jit(lambda b, tip: equilibrium_of(energy, b, tip, start))
     _, forward = jax.jvp(f, (b, tip), (move_b, move_tip))
     step = 1e-4
     moved = lambda s: eqx.tree_at(lambda e: e.terms[-1].tip, energy, tip + s * move_tip)  # noqa: E731
-    ends = [search(moved(s), b + s * move_b, start, force_tolerance=1e-11).x for s in (step, -step)]
+    ends = [search(moved(s), b + s * move_b, start, force_tolerance=TIGHT_FORCE).x for s in (step, -step)]
     difference = np.asarray(ends[0] - ends[1]) / (2 * step)
     # Positions of about 1 cm move by 1e-7 m and are converged to 1e-11 m.
     scale = float(np.abs(difference).max())

@@ -19,14 +19,14 @@ from tests.support.small_sheet import equilateral, jittered, search
 
 K, BEND, TIME_STEP = 30.0, 1.0, 0.02
 """Membrane [N/m], hinge springs [N/m] and time step [s]."""
-SHORT, LONG_ENOUGH = 3e-4, {"sweeps": 2, "steps": 20_000}
-"""Time step [s] and numbers for settling."""
+SETTLING_TIME_STEP, SETTLING = 3e-4, {"sweeps": 2, "steps": 20_000}
+"""Time step for settling [s], short enough to be stable, and its numbers of sweeps and steps."""
 GRAVITY = (0.0, 0.0, -9.81)
 MESH = jittered(equilateral(5, 5), 0.1)
 ATTACHED = np.where(MESH.rest[:, 0] < -8e-3, 3.0, 0.3)
-"""Springs of 3 N/m at the left, and weak ones that keep the rest from swinging freely [N/m]."""
+"""Springs of 3 N/m at the left, and weak ones that keep the other particles from swinging freely [N/m]."""
 CORNER = MESH.rest[np.argmax(MESH.rest[:, 0] + MESH.rest[:, 1])] + 1e-3
-"""Where the jaws close: not on a particle, whose spring would have no direction."""
+"""Position where the jaws close: not on a particle, whose spring would have no direction [m]."""
 
 settle = eqx.filter_jit(XPBD.settle)
 step = eqx.filter_jit(XPBD.step)
@@ -42,14 +42,14 @@ def simulator(time_step: float = TIME_STEP) -> XPBD:
 
 
 def energy(grip: Grip | None = None) -> SheetEnergy:
-    """The same springs and weight for the equilibrium solver."""
+    """Return the energy of the same springs and weight, for the equilibrium solver."""
     weight = Weight.build(MESH.particle_area, areal_density=1.0, gravity=GRAVITY)
     terms = (*springs(MESH), weight, *(() if grip is None else (grip,)))
     return SheetEnergy.build(MESH.rest, terms, Layout.from_pattern(MESH.adjacency, MESH.rest))
 
 
 def gripped(tip: np.ndarray) -> Grip:
-    """Jaws that closed at the corner, the tip moved since."""
+    """Return jaws that closed at the corner, with the tip moved since."""
     grip = Grip.build(jnp.asarray(MESH.rest), jnp.asarray(CORNER), radius=8e-3, stiffness=100.0)
     return eqx.tree_at(lambda g: g.tip, grip, jnp.asarray(tip))
 
@@ -92,33 +92,33 @@ def test_colours_hold_each_spring_once_and_no_particle_twice():
 
 
 def test_a_step_swept_to_the_end_is_implicit_euler_but_for_turning_springs():
-    """From rest and weightless, the tip moved by h: M (x - x_t) / dt^2 + grad U is of second order in h, because
-    Macklin's update leaves each impulse in the direction that its spring had when it was given."""
+    """From rest and without weight, the tip moved by h: M (x - x_t) / dt^2 + grad U is of second order in h, because
+    in Macklin's update each impulse keeps the direction that its spring had when the impulse was applied."""
     b = jnp.asarray(ATTACHED)
     sim = eqx.tree_at(lambda s: s.force, simulator(), replace_fn=jnp.zeros_like)
     imbalance = []
-    for h in (4e-4, 2e-4, 1e-4):
+    for h in (1e-4, 5e-5, 2.5e-5):
         grip = gripped(CORNER + h * np.array([0.5, 0.5, 0.7]))
         x = step(sim, sim.rest, b, grip, sweeps=3000)
         inertia = (x - sim.rest) / (sim.inverse_mass[:, None] * sim.time_step**2)
         elastic = energy(grip).gradient(x, b) + simulator().force
         imbalance.append(float(np.abs(inertia + elastic).max()))
-    np.testing.assert_allclose(np.divide(imbalance[:-1], imbalance[1:]), 4, rtol=0.15)
+    np.testing.assert_allclose(np.divide(imbalance[:-1], imbalance[1:]), 4, rtol=0.05)  # 3.88 and 3.95: third order
 
 
 @pytest.mark.parametrize("name", TIPS)
 def test_settling_reaches_the_equilibrium_both_ways(name):
-    """What settles has no force left but 1e-9 N (one particle weighs 4e-4 N), so Newton stays there; and what Newton
-    finds from there, tip moved and back, settles where it is, to a nanometre."""
+    """A settled state has unbalanced forces below 1e-9 N (one particle weighs 4e-4 N). Newton reaches the same state
+    within 1 um after the tip has moved and returned, and settling from there moves it by less than 0.1 um."""
     b, grip = jnp.asarray(ATTACHED), gripped(TIPS[name])
-    x = settle(simulator(SHORT), simulator(SHORT).rest, b, grip, **LONG_ENOUGH)
+    x = settle(simulator(SETTLING_TIME_STEP), simulator(SETTLING_TIME_STEP).rest, b, grip, **SETTLING)
     assert np.abs(energy(grip).gradient(x, b)).max() < 1e-9
     nudged = search(energy(gripped(TIPS[name] + 1e-4)), b, x).x
-    found = search(energy(grip), b, nudged)
-    assert found.converged
-    again = settle(simulator(SHORT), found.x, b, grip, **LONG_ENOUGH)
-    assert np.abs(found.x - again).max() < 1e-7
-    assert np.abs(found.x - x).max() < 1e-6
+    result = search(energy(grip), b, nudged)
+    assert result.converged
+    again = settle(simulator(SETTLING_TIME_STEP), result.x, b, grip, **SETTLING)
+    assert np.abs(result.x - again).max() < 1e-7
+    assert np.abs(result.x - x).max() < 1e-6
 
 
 def test_no_stiffness_is_no_constraint():
@@ -128,8 +128,8 @@ def test_no_stiffness_is_no_constraint():
     b = jnp.zeros(MESH.n)
     x = free.step(sim.rest, b, sweeps=3)
     np.testing.assert_allclose(x, np.asarray(sim.rest) + TIME_STEP**2 * np.asarray(GRAVITY), atol=1e-15)
-    slope = jax.jit(jax.jacfwd(lambda b: sim.step(sim.rest, b, sweeps=3)))(b)
-    assert np.isfinite(slope).all() and np.abs(slope).max() > 0
+    derivative = jax.jit(jax.jacfwd(lambda b: sim.step(sim.rest, b, sweeps=3)))(b)
+    assert np.isfinite(derivative).all() and np.abs(derivative).max() > 0
 
 
 def test_derivatives_agree_with_finite_differences_and_with_each_other():
@@ -152,12 +152,12 @@ def test_derivatives_agree_with_finite_differences_and_with_each_other():
 
 
 def test_at_the_equilibrium_unrolled_and_implicit_derivatives_agree():
-    """dx/db through all steps = -H^-1 diag(x - a), to one in a thousand."""
-    b, grip, sim = jnp.asarray(ATTACHED), gripped(TIPS["stretched"]), simulator(SHORT)
+    """dx/db through all steps = -H^-1 diag(x - a), to the 2e-5 that settling has not reached."""
+    b, grip, sim = jnp.asarray(ATTACHED), gripped(TIPS["stretched"]), simulator(SETTLING_TIME_STEP)
     model, db = energy(grip), jnp.asarray(np.random.default_rng(1).normal(size=MESH.n))
     x = search(model, b, sim.rest).x
     unrolled, implicit = (
         jax.jit(lambda b, db, f=f: jax.jvp(f, (b,), (db,))[1])(b, db)
-        for f in (lambda b: sim.settle(x, b, grip, **LONG_ENOUGH), lambda b: equilibrium(model, b, x).x)
+        for f in (lambda b: sim.settle(x, b, grip, **SETTLING), lambda b: equilibrium(model, b, x).x)
     )
-    np.testing.assert_allclose(unrolled, implicit, atol=1e-3 * np.abs(implicit).max())
+    np.testing.assert_allclose(unrolled, implicit, atol=1e-4 * np.abs(implicit).max())
