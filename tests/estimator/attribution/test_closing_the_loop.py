@@ -323,7 +323,7 @@ def test_the_file_and_the_page_hold_what_was_found(light, tmp_path):
     closed, found, _ = light
     assert json.loads(json.dumps(found)) == found
     assert {"verdict", "effects", "ambiguous_with", "tested", "held_out", "localisation"} <= set(found)
-    correlation = found["localisation"]["rank_correlation"]
+    correlation = found["localisation"]["correlates_with"]
     assert correlation["height"] is not None and abs(correlation["height"]) <= 1
     for name in ("a", "b"):
         write_page(tmp_path / f"{name}.html", name="light", sheet=_sheet(closed), found=found)
