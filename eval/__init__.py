@@ -1,1 +1,4 @@
-"""The only place where truth meets estimate: carrying, metrics, calibration, tracking, score and the report."""
+"""Evaluation, the only place where the truth is read: metrics, runs, reports, studies and benchmarks.
+
+Imports run one way: studies and benchmark, runs, report, metrics.
+"""

@@ -97,7 +97,7 @@ def suggested(found: Suggestion) -> dict[str, Any]:
         "hold_s": found.hold,
         "between": list(found.between),
         "expected_log_bayes_factor": found.expected,
-        "decisive": found.enough,
+        "enough": found.enough,
     }
 
 

@@ -47,7 +47,7 @@ def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
             "p_attached": fitted.probability.tolist(),
             "attached": fitted.attached.tolist(),
         },
-        "rank_correlation": {
+        "correlates_with": {
             name: _rank_correlation(distance, values) for name, values in _regressors(problem, fitted, frames).items()
         },
     }
@@ -66,7 +66,7 @@ def _regressors(problem: Problem, fitted: Fitted, frames: list[int]) -> dict[str
         "height": moved[:, :, 2],
         "displacement from rest": np.linalg.norm(moved, axis=2),
         "step since the previous frame": np.linalg.norm(states - before, axis=2),
-        "lowering": (before - states)[:, :, 2],
+        "downward step": (before - states)[:, :, 2],
         "distance to the grip": np.linalg.norm(rest[None] - grip[:, None], axis=2),
         "time since the jaws closed": np.array([history.frames[k].closed for k in frames])[:, None] * spread,
         "time since the start": np.array([history.frames[k].time for k in frames])[:, None] * spread,

@@ -1,1 +1,1 @@
-"""How long things take."""
+"""Benchmarks: the time of the estimator's parts and of the reference tissue."""

@@ -49,7 +49,7 @@ SIZES = (600, 1200)
 REPEATS = 7
 """Calls of which the median is reported."""
 SLOW_REPEATS = 3
-"""The same for calls that take seconds to minutes."""
+"""Calls of which the median is reported, for calls that take seconds to minutes."""
 MAX_BELIEF_PARTICLES = 10_000
 """Particles up to which the update is timed; beyond, the belief's dense n x n matrices would fill a GPU's memory."""
 MAX_SLOWDOWN = 3.0
@@ -228,7 +228,7 @@ def regressions(metrics: Metrics, baseline: Metrics) -> list[str]:
 
 def baseline() -> Metrics:
     """Return the committed baseline, measured on two CPU cores."""
-    return json.loads((files(__package__) / "baseline.json").read_text("utf-8"))
+    return json.loads((files("jiggle_mj.eval.benchmark") / "baseline.json").read_text("utf-8"))
 
 
 def _equilibrium(lift: Case) -> Callable[[], object]:

@@ -1,1 +1,1 @@
-"""Figures of an estimate against the truth."""
+"""Metrics: figures of an estimate against the truth, and the file that holds them."""

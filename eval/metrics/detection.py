@@ -1,4 +1,4 @@
-"""How well the detected particles match the truly attached ones, on the estimator's mesh.
+"""Agreement of the detected particles with the truly attached ones, on the estimator's mesh.
 
 PCD ("percentage of correct detections") is precision and PUG ("percentage of uncovered ground truth") is recall, as
 defined in Shinde, Liang et al., RSS 2024 (arXiv 2405.09743), section on estimation; both are fractions here. There the

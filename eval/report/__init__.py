@@ -1,1 +1,1 @@
-"""Pages that show a run."""
+"""Reports: HTML pages that show a run."""

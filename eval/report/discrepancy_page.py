@@ -90,7 +90,7 @@ def _suggestion_sentence(suggestion: Mapping[str, Any]) -> str:
     grasp, pull = (" ".join(f"{1e3 * part:.0f}" for part in suggestion[key]) for key in ("grasp_m", "pull_m"))
     between = " and ".join(suggestion["between"])
     expected = f"{suggestion['expected_log_bayes_factor']:.0f} nat"
-    if not suggestion["decisive"]:
+    if not suggestion["enough"]:
         return f"No pull that was tried distinguishes {between}: the largest expected log Bayes factor is {expected}."
     return (
         f"To distinguish {between}: grasp at {grasp} mm, pull by {pull} mm, and hold for {suggestion['hold_s']:.0f} s; "
@@ -113,7 +113,7 @@ def write_page(path: Path, *, name: str, sheet: Sheet, found: Mapping[str, Any])
         OutputError: the file cannot be written.
     """
     page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    templates = files(__package__) / "templates"
+    templates = files("jiggle_mj.eval.report") / "templates"
     pictures = _pictures(sheet, found).to_html(full_html=False, include_plotlyjs=True, div_id="discrepancy")
     text = page.from_string((templates / "discrepancy.html").read_text()).render(
         name=name,
@@ -169,7 +169,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
                   orientation="h", marker={"color": BEFORE}, showlegend=False)  # fmt: skip
     figure.add_trace(bars, row=2, col=1)
     for when, key, colour in zip(TIMES, LOCALISED, (BEFORE, AFTER), strict=True):
-        known = {name: value for name, value in found[key]["rank_correlation"].items() if value is not None}
+        known = {name: value for name, value in found[key]["correlates_with"].items() if value is not None}
         bars = go.Bar(x=[*known.values()], y=[*known], orientation="h", marker={"color": colour}, name=when)
         figure.add_trace(bars, row=2, col=2)
         frames = found[key]["frames"]

@@ -1,6 +1,6 @@
 """Stereo pairs as small JPEG data URIs, with the pixels of the particles in each image.
 
-Raw images are rectified first if the calibration asks for it, so that the points fall where the projection says.
+Raw images are rectified first if the calibration asks for it, so that the points lie at their projections.
 """
 
 import base64

@@ -97,7 +97,7 @@ def write_report(
         }
         for pair in pairs
     ]
-    here = files(__package__) / "templates"
+    here = files("jiggle_mj.eval.report") / "templates"
     page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     page.filters.update(number=_text, percent=_percent, milli=_milli)
     comparison = None

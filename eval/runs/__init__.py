@@ -1,1 +1,1 @@
-"""Whole jobs: a scene or a recording to results and a report."""
+"""Runs: complete jobs from a scene or a recording to results and a report."""

@@ -1,1 +1,1 @@
-"""Tables over many runs."""
+"""Studies: tables over many runs."""

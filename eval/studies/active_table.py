@@ -33,7 +33,7 @@ from .study import Study, Table
 SCENES = ("arc", "line", "line_dot", "arc_line", "u_shape", "large_attach")
 POLICIES: tuple[PolicyName, ...] = ("information", "one-grasp", "sl-d", "lg-d", "lg-h", *PRIMITIVES)
 BEST = "PMP, best"
-"""The primitive that reduces the entropy most in each run, as the paper reports it."""
+"""Name of the row of the primitive that reduces the entropy most in each run, as the paper reports it."""
 OURS, THEIRS = "information", "sl-d"
 """The two policies that are compared run by run."""
 STEPS = 40
@@ -71,7 +71,7 @@ Courses = Mapping[ActiveCell, Course]
 
 @dataclass(frozen=True, kw_only=True)
 class ActiveStudy(Study[ActiveCell, Course]):
-    """The study of policies."""
+    """Study of policies."""
 
     default_seeds: ClassVar[range] = range(10)
     sensing: Sensing
@@ -162,7 +162,7 @@ def with_best(runs: Courses) -> dict[ActiveCell, Course]:
 
 
 def observable_within_limits(runs: Courses) -> dict[tuple[str, int], Bool[np.ndarray, " n"]]:
-    """Return the attachments that some run within the limits loaded enough to show, by scene and seed."""
+    """Return the attachments that are observable in some run within the limits, by scene and seed."""
     found: dict[tuple[str, int], Bool[np.ndarray, " n"]] = {}
     for cell, run in runs.items():
         within = not (over_limit(run).any() or run.truth.observable is None)

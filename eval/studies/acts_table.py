@@ -1,9 +1,9 @@
-"""Whether a cut or suture that failed is noticed: acts that worked, and the same acts without any effect.
+"""Study of whether a failed cut or suture is noticed: acts that worked, and the same acts without any effect.
 
 A scene is lifted at its corners, and the attachments are estimated. Then one place at a time is cut that is believed
 attached, or sewn that is believed free. That happens in one copy of the tissue. In another copy the estimator gets the
-same event, and nothing is done. The two nearest corners are lifted again, and the log Bayes factor says which copy
-it was.
+same event, and nothing is done. The two nearest corners are lifted again, and the log Bayes factor decides between
+the two.
 """
 
 import copy
@@ -43,19 +43,19 @@ HEADINGS = ("worked, taken for failed", "failed, noticed", f"noticed at {FALSE_A
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the evidence says of one act."""
+    """Evidence about one act."""
 
     kind: str
     """Cut or Suture."""
     works: bool
-    """The truth."""
+    """Whether the act was carried out, the truth."""
     log_bayes_factor: float
     """Log Bayes factor of 'it worked' against 'nothing changed' [nat]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ActsCell:
-    """All acts of one scene and seed."""
+    """Cell that holds all acts of one scene and seed."""
 
     scene: str
     seed: int
@@ -63,7 +63,7 @@ class ActsCell:
 
 @dataclass(frozen=True, kw_only=True)
 class ActsStudy(Study[ActsCell, list[Verdict]]):
-    """The study of acts that worked and acts that did not."""
+    """Study of acts that worked and acts that did not."""
 
     default_seeds: ClassVar[range] = range(6)
     scenes: tuple[str, ...] = SCENES
@@ -83,7 +83,7 @@ class ActsStudy(Study[ActsCell, list[Verdict]]):
         path.write_text(json.dumps(made_by() | {"verdicts": found}, indent=1) + "\n")
 
     def verdicts(self, cell: ActsCell) -> list[Verdict]:
-        """Carry out all acts of a cell, and return what the evidence says of each."""
+        """Carry out all acts of a cell, and return the evidence about each."""
         return verdicts(load_scene(cell.scene), cell.seed, acts_of_a_kind=self.acts_of_a_kind)
 
     def is_current(self, cell: ActsCell, path: Path) -> bool:
@@ -107,7 +107,7 @@ class ActsStudy(Study[ActsCell, list[Verdict]]):
 
 
 def verdicts(scene: Scene, seed: int, *, acts_of_a_kind: int = ACTS_OF_A_KIND) -> list[Verdict]:
-    """Carry out all acts in one scene, each with and without its effect, and return what the evidence says.
+    """Carry out all acts in one scene, each with and without its effect, and return the evidence about each.
 
     Args:
         scene: the tissue.
@@ -133,7 +133,7 @@ def log_bayes_factor_after(
 ) -> float:
     """Return the log Bayes factor of 'it worked' after an act and lifts of the nearest corners [nat].
 
-    It is 0 where no frame says anything of the act.
+    It is 0 where no frame shows anything of the act.
 
     Args:
         scene: whose corners are lifted.

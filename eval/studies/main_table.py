@@ -59,7 +59,7 @@ FIGURES: Columns = (
 
 @dataclass(frozen=True, kw_only=True)
 class MainStudy(Study[MainCell, Json]):
-    """The study of docs/RESULTS.md."""
+    """Study of docs/RESULTS.md."""
 
     default_seeds: ClassVar[range] = range(3)
     rows: tuple[MainRow, ...] = MAIN

@@ -1,4 +1,4 @@
-"""The paper's two tables of simulated estimation, printed figures beside measured ones.
+"""The paper's two tables of simulated estimation, printed figures and measured ones.
 
 Table 1 (`simulation`) lifts four corners in turn. The appendix (`one-lift`) lifts the first of them. Each of five
 shapes meets each method and three references: the two engines of `same_engine`, and MuJoCo's vertices with noise, by
@@ -130,7 +130,7 @@ ROWS = tuple(
     for scene in SCENES
     for method in METHODS
 )
-"""All lines, those of one reference together."""
+"""Rows of a measured table, those of one reference together."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -60,7 +60,7 @@ OPEN_RADIUS = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class SameEngine:
-    """What is declared to the estimator, what it sees, and the truth that only the scoring may read."""
+    """Declaration and observations for the estimator, and the truth that only the scoring may read."""
 
     declaration: Declaration
     observations: tuple[Observation, ...]

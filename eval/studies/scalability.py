@@ -1,4 +1,4 @@
-"""How planning grows with the sheet: seconds for one action of the paper's SL-D and for one of ours, at each size.
+"""Study of how planning grows with the sheet: seconds for one action of the paper's SL-D and of ours, at each size.
 
 SL-D draws 100 samples in five iterations. Ours is what `InformationPolicy` computes where the jaws are: all pulls in
 one tissue and the likeliest in another, for what they teach; the place of the tip in sixteen, for the energy that was
@@ -48,7 +48,7 @@ class PlanTimes:
 
 @dataclass(frozen=True, kw_only=True)
 class ScalabilityStudy(Study[int, PlanTimes]):
-    """The study of planning times; a cell is a number of particles."""
+    """Study of planning times; a cell is a number of particles."""
 
     default_seeds: ClassVar[range] = range(0)
     sizes: tuple[int, ...] = PARTICLE_COUNTS

@@ -86,7 +86,7 @@ def run_study(
     """Run the cells that are not current, and read all of them.
 
     Args:
-        study: says how.
+        study: runs and reads the cells.
         cells: of the study, those to run and read.
         directory: holds a folder or a file for each cell.
         executor: runs several cells at a time; None runs one after the other in this process.

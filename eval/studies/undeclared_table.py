@@ -1,4 +1,4 @@
-"""Whether closing the loop names what a scene holds and nobody declares: the panel, run and counted."""
+"""Study of whether closing the loop names the effects that a scene holds and nobody declares."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -41,7 +41,7 @@ class UndeclaredCell:
 
 @dataclass(frozen=True, kw_only=True)
 class UndeclaredStudy(Study[UndeclaredCell, Discrepancy]):
-    """The study of undeclared effects."""
+    """Study of undeclared effects."""
 
     default_seeds: ClassVar[range] = range(5)
     rows: tuple[str, ...] = tuple(ROWS)

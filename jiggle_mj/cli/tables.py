@@ -41,14 +41,14 @@ class _Main(_TableOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class _Active(_TableOptions):
-    """Comparison of policies as in the paper, with ours; writes the curves to OUT/active.html."""
+    """Comparison of policies as in the paper, with ours; the curves are in OUT/active.html."""
 
     seeds: tuple[int, ...] | None = None
     """Seeds of each row; 0 to 9 if left out."""
     sensing: Sensing = "particles"
-    """What the estimator sees."""
+    """Sensing: what the estimator sees."""
     jobs: int | None = None
-    """How many runs at a time; as many as there are usable cores if left out."""
+    """Number of runs at a time; the number of usable cores if left out."""
 
     def run(self) -> None:
         from jiggle_mj.eval.studies.active_curves import PAGE, write_curves
@@ -61,12 +61,12 @@ class _Active(_TableOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class _Acts(_TableOptions):
-    """Whether failed cuts and sutures are noticed."""
+    """Table of whether failed cuts and sutures are noticed."""
 
     seeds: tuple[int, ...] | None = None
     """Seeds of each scene; 0 to 5 if left out."""
     jobs: int | None = None
-    """How many runs at a time; as many as there are usable cores if left out."""
+    """Number of runs at a time; the number of usable cores if left out."""
 
     def run(self) -> None:
         from jiggle_mj.eval.studies.acts_table import ActsStudy
@@ -76,7 +76,7 @@ class _Acts(_TableOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class _Undeclared(_TableOptions):
-    """Whether close-loop names what nobody declares."""
+    """Table of whether close-loop names what nobody declares."""
 
     seeds: tuple[int, ...] | None = None
     """Seeds of each row; 0 to 4 if left out."""
@@ -84,7 +84,7 @@ class _Undeclared(_TableOptions):
     """Rows of the panel: one effect of the library, two together, one from images, what is outside the library, or
     nothing; all if left out."""
     jobs: int | None = None
-    """How many runs at a time; as many as there are usable cores if left out."""
+    """Number of runs at a time; the number of usable cores if left out."""
 
     def run(self) -> None:
         from jiggle_mj.eval.studies.undeclared_panel import GROUPS
@@ -117,7 +117,7 @@ class _Paper(_TableOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class _Simulation(_Paper):
-    """Table of the paper with four lifts, printed beside measured, with all baselines."""
+    """Table of the paper with four lifts, printed and measured, with all baselines."""
 
     def run(self) -> None:
         self._run("simulation")
@@ -125,7 +125,7 @@ class _Simulation(_Paper):
 
 @dataclass(frozen=True, kw_only=True)
 class _OneLift(_Paper):
-    """Table of the paper's appendix with one lift, printed beside measured, with all baselines."""
+    """Table of the paper's appendix with one lift, printed and measured, with all baselines."""
 
     def run(self) -> None:
         self._run("one-lift")

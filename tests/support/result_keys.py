@@ -1,4 +1,4 @@
-"""The keys of `result.json`, as its contract has them."""
+"""Keys of `result.json`, as documented."""
 
 BY_DILATION = {rings: dict.fromkeys(("pcd", "pug", "f1")) for rings in "012"}
 KEYS = {
@@ -27,5 +27,5 @@ KEYS = {
 
 
 def keys(value: object) -> object:
-    """The tree of keys of nested dictionaries."""
+    """Return the tree of keys of nested dictionaries."""
     return {name: keys(inner) for name, inner in value.items()} if isinstance(value, dict) else None

@@ -7,6 +7,9 @@ import pytest
 
 from jiggle_mj.eval.benchmark import estimator_benchmark as bench
 
+MIN_SHARE = 0.75
+"""Smallest share that shows that something is found; with every particle called free it is 0.728."""
+
 
 @pytest.mark.slow
 def test_a_small_benchmark_has_its_figures_and_finds_the_disc():
@@ -14,7 +17,7 @@ def test_a_small_benchmark_has_its_figures_and_finds_the_disc():
     metrics = bench.benchmark((85,), paper=False, log=lambda _: None)
     assert {"device", "equilibrium_n85_s", "update_n85_s", "update_n85_compile_s", "found_share"} <= set(metrics)
     assert float(metrics["update_n85_s"]["value"]) > 0
-    assert float(metrics["found_share"]["value"]) > 0.75  # all called free: 0.728
+    assert float(metrics["found_share"]["value"]) > MIN_SHARE
     json.dumps(metrics, allow_nan=False)
 
 

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jiggle_mj.estimate import Estimate, Sheet
@@ -14,6 +14,8 @@ from jiggle_mj.eval.metrics.tracking import tracking
 from jiggle_mj.eval.metrics.truth_transfer import barycentric_weights, transfer
 from jiggle_mj.truth import Truth, TruthFrame
 
+ROUNDING = 1e-12
+"""Rounding of sums and products of numbers of order one."""
 STRIP = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 6], [5, 7, 6], [6, 7, 8], [7, 9, 8]])
 """A strip of eight triangles over vertices 0..9: vertex i has the neighbours i-2, i-1, i+1, i+2."""
 
@@ -130,6 +132,7 @@ def test_patches_are_the_connected_groups_largest_first():
 sets = st.lists(st.booleans(), min_size=10, max_size=10).map(lambda each: np.array(each, dtype=bool))
 
 
+@settings(deadline=None)  # the claim is not about time
 @given(detected=sets, attached=sets)
 def test_dilation_never_lowers_a_figure(detected, attached):
     """dilate(T) contains T, so PCD and PUG are non-decreasing in the number of rings."""
@@ -141,6 +144,7 @@ def test_dilation_never_lowers_a_figure(detected, attached):
             assert low is None or high >= low
 
 
+@settings(deadline=None)  # the claim is not about time
 @given(detected=sets, attached=sets, order=st.permutations(range(10)), rings=st.integers(0, 2))
 def test_renumbering_the_vertices_changes_nothing(detected, attached, order, rings):
     """Figures depend on the sets and the graph, not on the numbering."""
@@ -153,6 +157,7 @@ def test_renumbering_the_vertices_changes_nothing(detected, attached, order, rin
     assert average_precision(score, attached) == average_precision(score[order], attached[order])
 
 
+@settings(deadline=None)  # the claim is not about time
 @given(one=sets)
 def test_dilation_by_two_is_dilation_twice(one):
     np.testing.assert_array_equal(dilate(one, STRIP, 2), dilate(dilate(one, STRIP, 1), STRIP, 1))
@@ -163,7 +168,7 @@ def test_truth_is_unchanged_on_the_same_mesh():
     stiffness = np.where(rest[:, 0] == 0, 0.7, 0.0)
     transferred = transfer(Sheet(rest=rest, faces=faces), truth_of(rest, faces, stiffness), 0)
     np.testing.assert_array_equal(transferred.attached, stiffness > 0)
-    np.testing.assert_allclose(transferred.stiffness, stiffness, atol=1e-12)
+    np.testing.assert_allclose(transferred.stiffness, stiffness, atol=ROUNDING)
 
 
 def test_springs_keep_their_total_and_their_centre_on_any_mesh():
@@ -171,8 +176,8 @@ def test_springs_keep_their_total_and_their_centre_on_any_mesh():
     fine, coarse = lattice(13, 0.01), lattice(7, 0.017)
     stiffness = np.where(np.linalg.norm(fine[0][:, :2] - 0.05, axis=1) < 0.023, 0.7, 0.0)
     transferred = transfer(Sheet(rest=coarse[0], faces=coarse[1]), truth_of(*fine, stiffness), 0)
-    assert transferred.stiffness.sum() == pytest.approx(stiffness.sum(), rel=1e-12)
-    np.testing.assert_allclose(transferred.stiffness @ coarse[0], stiffness @ fine[0], rtol=1e-12)
+    assert transferred.stiffness.sum() == pytest.approx(stiffness.sum(), rel=ROUNDING)
+    np.testing.assert_allclose(transferred.stiffness @ coarse[0], stiffness @ fine[0], rtol=ROUNDING)
 
 
 def test_a_spring_pulls_at_the_corners_of_the_triangle_that_it_is_in():
@@ -226,7 +231,7 @@ def test_barycentric_weights_give_the_nearest_point_of_the_mesh():
     vertices, faces = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
     corners, weights = barycentric_weights(np.array([[0.2, 0.3, 1], [2, 0, 0]]), vertices, faces)
     assert corners.tolist() == [[0, 1, 2]] * 2
-    np.testing.assert_allclose(weights, [[0.5, 0.2, 0.3], [0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(weights, [[0.5, 0.2, 0.3], [0, 1, 0]], atol=ROUNDING)
 
 
 def test_tracking_rms_is_over_seen_particles_at_interpolated_truth():

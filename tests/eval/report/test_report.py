@@ -1,4 +1,4 @@
-"""The page: whole without any part of its input, deterministic, closed to the network, and right in a real browser."""
+"""The page: complete without any part of its input, deterministic, without network, and correct in a real browser."""
 
 import dataclasses
 import json
@@ -29,7 +29,8 @@ from jiggle_mj.truth import Truth, TruthFrame
 
 SIDE = 0.1
 """Side of the synthetic sheet [m]."""
-LIMIT_BYTES = 15_000_000
+MAX_PAGE_BYTES = 15_000_000
+"""Largest size of the page [bytes]."""
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or ""
 SPEED_ADVICE = ("willReadFrequently", "GPU stall due to ReadPixels")
 """Chromium's hints on the speed of its own software renderer; no fault of the page."""
@@ -39,7 +40,11 @@ document.getElementById("slider").dispatchEvent(new Event("input"));
 document.querySelector("input[value=sd]").click();
 </script>"""
 ROUNDING = 1e-9
-"""Cells whose centre is on the border of a triangle belong to it, whichever way the sum is rounded."""
+"""Rounding of coordinates of order one; cells with a centre on the border of a triangle belong to it."""
+SUM_ROUNDING = 1e-12
+"""Rounding of a weighted sum of three numbers of order one."""
+PAGE_ROUNDING_MM = 0.01
+"""Rounding of coordinates on the page [mm]."""
 SETTINGS = {
     "declaration": {"membrane_stiffness": 44.0, "poisson": 0.45, "areal_density": 1.0},
     "filter": {"tau": 2e-4, "prior_sd": 0.5},
@@ -48,7 +53,7 @@ SETTINGS = {
 
 
 def hexagonal(spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """A sheet of about equilateral triangles centred on the origin."""
+    """Return a sheet of about equilateral triangles centred on the origin."""
     rows = np.arange(-SIDE / 2, SIDE / 2 + 1e-9, spacing * np.sqrt(3) / 2)
     flat = np.concatenate(
         [
@@ -61,14 +66,14 @@ def hexagonal(spacing: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lifted(rest: np.ndarray, corner: np.ndarray, height: float) -> np.ndarray:
-    """A bump over one corner."""
+    """Return the sheet with a bump over one corner."""
     away = np.linalg.norm(rest[:, :2] - corner, axis=1)
     return rest + height * np.exp(-((away / 0.04) ** 2))[:, None] * np.array([0, 0, 1.0])
 
 
 @cache
 def synthetic() -> dict:
-    """A run of 36 frames: four corners lifted nine times each, two lines attached, one of them half missed."""
+    """Return a run of 36 frames: four corners lifted nine times each, two lines attached, one of them half missed."""
     rng = np.random.default_rng(0)
     rest, faces = hexagonal(0.0042)
     vertices, triangles = hexagonal(0.005)
@@ -162,7 +167,7 @@ def synthetic() -> dict:
 
 
 def looking_down(distance: float, tilt_degrees: float) -> np.ndarray:
-    """Camera to world: it looks at the origin, tilted from the vertical towards -y."""
+    """Return the pose of a camera that views the origin, tilted from the vertical towards -y."""
     tilt = np.radians(tilt_degrees)
     forward = np.array([0, np.sin(tilt), -np.cos(tilt)])
     right = np.array([1.0, 0, 0])
@@ -173,7 +178,7 @@ def looking_down(distance: float, tilt_degrees: float) -> np.ndarray:
 
 
 def write(path: Path, *, truth: bool, images: bool, **changes) -> str:
-    """Write the synthetic run's page and give its text."""
+    """Write the synthetic run's page and return its text."""
     run = synthetic()
     parts = {name: run[name] for name in ("sheet", "estimates", "belief", "detection")} | changes
     scored = with_truth(run["unscored"], **parts, truth=run["truth"]) if truth else run["unscored"]
@@ -190,7 +195,7 @@ def write(path: Path, *, truth: bool, images: bool, **changes) -> str:
 
 
 def own_markup(page: str) -> str:
-    """The page without the text of its scripts."""
+    """Return the page without the text of its scripts."""
     return re.sub(r"(<script[^>]*>).*?(</script>)", r"\1\2", page, flags=re.DOTALL)
 
 
@@ -225,7 +230,7 @@ def test_the_page_says_how_a_policy_ended_with_its_acts_and_draws_the_path_of_th
     first = next(estimate for estimate in run["estimates"] if estimate.held.any())
     held = first.positions[first.held].mean(axis=0) * 1e3
     payload = json.loads(re.search(r'id="payload"[^>]*>(.*?)</script>', whole, flags=re.DOTALL).group(1))
-    assert np.allclose([axis[0] for axis in payload["paths"][0]["xyz"]], held, atol=0.01)
+    assert np.allclose([axis[0] for axis in payload["paths"][0]["xyz"]], held, atol=PAGE_ROUNDING_MM)
 
 
 def test_doubts_are_listed_where_there_are_any(tmp_path):
@@ -248,7 +253,7 @@ def test_the_page_asks_nothing_of_the_network_and_stays_small(tmp_path):
     page = write(path, truth=True, images=True)
     assert not re.search(r"(src|href)=[\"'](?!data:)", own_markup(page))
     assert "default-src 'none'" in page and "connect-src" not in page
-    assert path.stat().st_size < LIMIT_BYTES
+    assert path.stat().st_size < MAX_PAGE_BYTES
 
 
 def test_an_estimator_without_uncertainty_has_a_page(tmp_path):
@@ -287,7 +292,7 @@ def test_a_report_of_nothing_and_images_without_a_camera_are_refused(tmp_path):
 
 
 def estimate_of(positions: np.ndarray, observed: np.ndarray, mean: float) -> Estimate:
-    """The first synthetic estimate, with other particles."""
+    """Return the first synthetic estimate, with other particles."""
     n = len(positions)
     return replace(
         synthetic()["estimates"][0],
@@ -335,7 +340,7 @@ def test_the_map_interpolates_linearly_over_triangles():
     x, y, corners, weights = grid_of(flat, np.array([[0, 1, 2]]))
     values = np.sum((flat @ [2.0, -1.0])[corners] * weights, axis=-1)
     inside = x[None] + y[:, None] < 4 + ROUNDING
-    np.testing.assert_allclose(values[inside], (2 * x[None] - y[:, None])[inside], atol=1e-12)
+    np.testing.assert_allclose(values[inside], (2 * x[None] - y[:, None])[inside], atol=SUM_ROUNDING)
     assert np.isnan(values[~inside]).all()
 
 

@@ -1,4 +1,4 @@
-"""Policies in closed loop with a small reference: what they do, what they keep to, and what they say at the end."""
+"""Policies in closed loop with a small reference: their actions, their limits, and the reason why they end."""
 
 import itertools
 import json
@@ -17,6 +17,7 @@ from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.planning.information_config import InformationPolicyConfig
 from jiggle_mj.estimator.planning.information_policy import InformationPolicy
 from jiggle_mj.estimator.planning.policy import STEP, Policy
+from jiggle_mj.estimator.planning.procedures import Detach
 from jiggle_mj.eval.runs.acting import actions, check_policy_fits, most_actions, policy_named
 from jiggle_mj.eval.runs.experiment import run_scene
 from jiggle_mj.limits import Limits
@@ -26,6 +27,12 @@ from jiggle_mj.scenes import Reference, load_scene, programme
 from tests.support.result_keys import KEYS, keys
 from tests.support.tiny_scene import SCENE, call, scene_file
 
+DISC_RADIUS = 12e-3
+"""Radius of the attached disc in the middle of the tiny scene [m]."""
+MAX_REFIT_ERROR = 0.95
+"""Largest squared error after refits, as a share of that without: a refit must gain more than rounding."""
+ROUNDING = 1e-9
+"""Rounding of a distance between two tips [m]."""
 PAPERS = ("pmp-up", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sl-d", "lg-d", "lg-h")))
 
 
@@ -35,7 +42,7 @@ def scene(tmp_path_factory):
 
 
 class Loop:
-    """A policy and a tissue, step by step."""
+    """Run of a policy on a tissue, with its actions and entropies."""
 
     def __init__(self, scene, policy: Policy, *, steps: int):
         with Reference(scene, seed=0, sensing="particles") as reference:
@@ -81,7 +88,7 @@ def test_the_same_seed_plans_the_same(scene, ours):
             np.testing.assert_array_equal(old.to, new.to)
 
 
-def test_a_second_look_at_each_frame_is_nearer_to_the_truth(scene):
+def test_a_refit_after_each_frame_is_nearer_to_the_truth(scene):
     """Mean squared error of P(attached) over the frames of the first lift, of the disc in the middle."""
     error = {}
     for refinement in ("grasps", "frames"):
@@ -90,9 +97,10 @@ def test_a_second_look_at_each_frame_is_nearer_to_the_truth(scene):
                 reference.declaration, reference.camera, config=EstimatorConfig(refinement=refinement)
             )
             found = [estimator.update(reference.step(action)) for action in islice(programme(scene), 6)]
-        held = np.linalg.norm(estimator.sheet.rest[:, :2], axis=1) < 12e-3
-        error[refinement] = np.mean([(one.probability - held) ** 2 for one in found if one is not None])
-    assert error["frames"] < 0.95 * error["grasps"]
+        attached = np.linalg.norm(estimator.sheet.rest[:, :2], axis=1) < DISC_RADIUS
+        estimates = [estimate for estimate in found if estimate is not None]
+        error[refinement] = np.mean([(estimate.probability - attached) ** 2 for estimate in estimates])
+    assert error["frames"] < MAX_REFIT_ERROR * error["grasps"]
 
 
 @pytest.mark.parametrize("name", PAPERS)
@@ -104,7 +112,7 @@ def test_the_papers_policies_move_the_grasp_that_they_are_given(scene, name):
     planned = [one.action for one in policy.decisions]
     assert planned and all(isinstance(action, Move) for action in planned)
     tips = [action.to for action in loop.done if isinstance(action, Move)]
-    assert max(np.linalg.norm(b - a) for a, b in pairwise(tips[-len(planned) - 1 :])) <= STEP + 1e-9
+    assert max(np.linalg.norm(b - a) for a, b in pairwise(tips[-len(planned) - 1 :])) <= STEP + ROUNDING
 
 
 def test_where_nothing_is_safe_nothing_is_grasped_and_it_says_so(scene):
@@ -159,18 +167,18 @@ def test_where_every_attachment_is_decided_enough_is_known(ours, monkeypatch):
     opened = replace(loop.estimator.tool, closed=False)
     monkeypatch.setattr(Estimator, "tool", property(lambda _: opened))
     nothing = np.zeros(len(loop.estimator.sheet.rest), bool)
-    said = InformationPolicy(Limits(), radius=8e-3, seed=0, about=nothing).plan(loop.estimator)
-    assert said == "enough is known: every P(attached) is below 0.05 or above 0.95"
+    reason = InformationPolicy(Limits(), radius=8e-3, seed=0, about=nothing).plan(loop.estimator)
+    assert reason == "enough is known: every P(attached) is below 0.05 or above 0.95"
 
 
-def test_a_run_that_is_told_to_stop_writes_what_it_has(scene, tmp_path):
+def test_a_run_that_is_stopped_writes_what_it_has(scene, tmp_path):
     asked = itertools.count()
     figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", stop=lambda: next(asked) > 4)
     assert figures["ended"] == "it was interrupted" and figures["n_frames"] == 5
     assert figures["detection"]["n_attached"] > 0 and (tmp_path / "out" / "report.html").exists()
 
 
-def test_the_first_interrupt_is_a_wish_and_the_second_an_order():
+def test_the_first_interrupt_ends_the_run_and_the_second_stops_at_once():
     before = signal.getsignal(signal.SIGINT)
     with patient() as stopped:
         assert not stopped()
@@ -230,14 +238,14 @@ def test_an_interrupted_plan_is_the_end_of_the_run_not_of_the_results():
     assert len(done) == 1 and policy.ended == "it was interrupted"
 
 
-def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, monkeypatch, capsys):
+def test_a_run_with_a_policy_writes_all_and_counts_frames_over_the_limits(tmp_path, monkeypatch, capsys):
     path = scene_file(tmp_path, text=SCENE + "[limits]\nforce = 1e-5\n")
     arguments = ("--sensing", "particles", "--policy", "pmp-up", "--steps", 3, "--json")
     assert call(monkeypatch, "run", path, "--out", tmp_path / "out", *arguments) == 0
     figures = json.loads(capsys.readouterr().out)
     assert keys(figures) == KEYS
     assert figures["policy"] == "pmp-up" and figures["ended"] == "all 3 steps are done"
-    assert [one["does"][:7] for one in figures["decisions"]] == ["move to"] * 3
+    assert [decision["does"][:7] for decision in figures["decisions"]] == ["move to"] * 3
     assert "Actions and reasons" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert figures["timing"]["plan_s"] > 0 and figures["safety"]["limit_n"] == 1e-5
     safety = figures["safety"]
@@ -248,34 +256,34 @@ def test_a_run_with_a_policy_writes_all_and_is_judged_by_the_limits(tmp_path, mo
 
 
 class Corners(InformationPolicy):
-    """Four corner lifts, wherever the corners lie, in place of looks that take minutes."""
+    """Four corner lifts, wherever the corners lie, in place of plans that take minutes."""
 
     refused = Policy.refused
 
     def __init__(self):
         Policy.__init__(self)
         self.regrasps = False
-        ways = ((-1, -1), (1, -1), (1, 1), (-1, 1))
-        self._left = [(way, height) for way in ways for height in (None, 0.01, 0.02, 0.03, 0.0, "open")]
+        corners = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        self._planned = [(corner, height) for corner in corners for height in (None, 0.01, 0.02, 0.03, 0.0, "open")]
 
     def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
-        if not self._left:
+        if not self._planned:
             return "enough was seen"
-        way, height = self._left.pop(0)
+        direction, height = self._planned.pop(0)
         if height == "open":
             return Release(), "the next"
         if height is None:
-            corner = np.argmax(estimator.begin().rest[:, :2] @ np.array(way))
+            corner = np.argmax(estimator.begin().rest[:, :2] @ np.array(direction))
             self._point = estimator.positions[corner]
             return Grasp(point=self._point, radius=8e-3), "the next"
         return Move(to=self._point + np.array([0, 0, height])), "higher"
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, monkeypatch, fails):
+def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, fails):
     scene = load_scene(str(scene_file(tmp_path, text=SCENE + f"[procedure]\ncut_fails = {int(fails)}\n")))
-    monkeypatch.setattr("jiggle_mj.eval.runs.acting.partial", lambda *_, **__: lambda **_: Corners())
-    figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="detach", steps=60)
+    planner = Detach(lambda **_: Corners())
+    figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="detach", planner=planner, steps=60)
     done = figures["procedure"]
     assert keys(figures) == KEYS | {"procedure": dict.fromkeys(("name", "cycles", "success", "acts"))}
     assert done["name"] == "detach" and done["success"] is not fails
@@ -287,24 +295,23 @@ def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, mon
 
 
 class Misses(Corners):
-    """Grasps one corner, and then thin air."""
+    """Grasps one corner, and then a place above the tissue."""
 
     def plan(self, estimator: Estimator) -> tuple[Action, str] | str:
         planned = super().plan(estimator)
         if len(self.decisions) > 2 and not isinstance(planned, str) and isinstance(planned[0], Grasp):
-            return Grasp(point=np.array([0.0, 0.0, 0.5]), radius=8e-3), "thin air"
+            return Grasp(point=np.array([0.0, 0.0, 0.5]), radius=8e-3), "above the tissue"
         return planned
 
 
-def test_a_grasp_that_misses_ends_the_run_and_loses_nothing(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("jiggle_mj.eval.runs.experiment.policy_named", lambda *_, **__: Misses())
-    figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="information")
+def test_a_grasp_that_misses_ends_the_run_and_loses_nothing(scene, tmp_path):
+    figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="information", planner=Misses())
     assert figures["ended"].startswith("an action could not be carried out: grasp at")
     assert figures["detection"]["n_attached"] > 0 and (tmp_path / "out" / "report.html").exists()
 
 
 def test_where_a_grasp_of_ours_has_missed_it_grasps_elsewhere(scene, tmp_path, monkeypatch):
-    """What it takes for tissue is none: the first grasp meets nothing."""
+    """The first grasp meets no tissue."""
     tried: list[np.ndarray] = []
     step = Reference.step
 

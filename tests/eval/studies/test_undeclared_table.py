@@ -16,12 +16,12 @@ from jiggle_mj.eval.runs.closing_the_loop import DISCREPANCY
 from jiggle_mj.eval.studies.study import run_study
 from jiggle_mj.eval.studies.undeclared_panel import (
     GROUPS,
-    MOVING,
     NOTHING,
     OUTSIDE,
     ROWS,
-    SHIPPED,
+    SHIPPED_SPACING,
     TOGETHER,
+    UNSETTLED,
     scene_with,
 )
 from jiggle_mj.eval.studies.undeclared_table import UndeclaredCell, UndeclaredStudy
@@ -54,13 +54,13 @@ def test_scenes_differ_by_what_is_undeclared_alone_and_keep_it_secret():
     plain = {(row.layout, row.spacing): scene_with(name, 0).attachments for name, row in NOTHING.items()}
     for name, row in ROWS.items():
         scene = scene_with(name, 0)
-        assert len(scene.disturbances) == max(len(row.effects), name in OUTSIDE) + (MOVING in scene.disturbances)
+        assert len(scene.disturbances) == max(len(row.effects), name in OUTSIDE) + (UNSETTLED in scene.disturbances)
         assert scene.secret and scene.attachments == plain[row.layout, row.spacing]
 
 
 def test_attachments_are_as_shipped_on_a_mesh_as_fine_as_there_and_wider_and_stiffer_on_a_coarser_one():
     shipped, (coarser,) = load_scene("arc").attachments, scene_with("nothing", 0).attachments
-    assert load_scene("arc").tissue.spacing == SHIPPED
+    assert load_scene("arc").tissue.spacing == SHIPPED_SPACING
     assert scene_with("nothing, images", 0).attachments == shipped
     assert coarser == replace(shipped[0], width=0.0115, stiffness=2.0)
     assert len(scene_with("nothing, U shape", 0).attachments) == 3
@@ -74,7 +74,7 @@ def test_every_row_has_a_name_of_its_own():
 def test_what_is_inside_is_in_the_library_and_what_is_outside_is_not():
     names = {effect.name for effect in LIBRARY}
     assert {effect for row in ROWS.values() for effect in row.effects} <= names
-    assert not {type(one).__name__.lower() for row in OUTSIDE.values() for one in row.disturbances} & names
+    assert not {type(d).__name__.lower() for row in OUTSIDE.values() for d in row.disturbances} & names
 
 
 def test_true_sizes_are_of_the_row_s_own_effects_and_as_long_at_most():
@@ -87,7 +87,7 @@ def test_true_sizes_are_of_the_row_s_own_effects_and_as_long_at_most():
 def test_two_effects_are_each_of_another_name_and_begin_in_turn():
     for row in TOGETHER.values():
         assert len(set(row.effects)) == 2
-        assert [one.start for one in row.disturbances] == sorted(one.start for one in row.disturbances)
+        assert [d.start for d in row.disturbances] == sorted(d.start for d in row.disturbances)
 
 
 def test_noise_is_as_strong_in_every_row():
