@@ -7,6 +7,7 @@ from jiggle_mj.options import FilterName
 
 from .belief.prior import PriorConfig
 from .filters.config import FilterConfig, SamplingConfig
+from .perception.config import PerceptionConfig
 from .physics.surrogate import Membrane
 
 Refinement = Literal["grasps", "frames", "end"]
@@ -64,6 +65,8 @@ class EstimatorConfig:
     samples after each frame, which takes a second or two instead of a sweep's milliseconds."""
     detect_above: float = 0.011
     """Mean stiffness above which filters without P(attached) report a particle as attached [k]."""
+    perception: PerceptionConfig = field(default_factory=PerceptionConfig)
+    """Numbers of the trackers of images, points and clouds."""
     linearisation: FilterConfig = field(default_factory=FilterConfig)
     """Numbers of the filter 'implicit'."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)

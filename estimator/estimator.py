@@ -31,7 +31,7 @@ from .filters.posterior_summary import Convergence, PosteriorSummary
 from .fusion import fill_unseen, fuse, pull
 from .grip import GripHold, GripTracker
 from .identification import identify
-from .perception import Believed, Disparity, Perception, TissueMask, Track
+from .perception import Disparity, Perception, SimulatorInput, TissueMask, Track
 from .physics.environment import Grip
 from .tracked_sheet import TrackedSheet
 
@@ -63,7 +63,14 @@ class Estimator:
         self.declaration, self.config = declaration, config or EstimatorConfig()
         self.skipped: list[tuple[int, str]] = []
         """Index and reason of each observation that could not be used."""
-        self._perception = Perception(declaration, camera, spacing=self.config.spacing, mask=mask, disparity=disparity)
+        self._perception = Perception(
+            declaration,
+            camera,
+            spacing=self.config.spacing,
+            config=self.config.perception,
+            mask=mask,
+            disparity=disparity,
+        )
         self._grip = GripTracker()
         self._sheet: TrackedSheet | None = None
         self._open_frame: Observation | None = None
@@ -314,7 +321,7 @@ class Estimator:
 
     def force_unknown(self, held: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return the particles that a grip on the held ones may pull at, the held ones included."""
-        return self._begun.field.widened(held)
+        return self._begun.field.dilated(held)
 
     @property
     def _begun(self) -> TrackedSheet:
@@ -350,10 +357,10 @@ class Estimator:
 
     def _see(self, observation: Observation) -> Track:
         return self._perception.track(
-            observation, predicted=self._begun.x, believed=lambda: self._prediction(observation.tool)
+            observation, predicted=self._begun.x, simulator_input=lambda: self._prediction(observation.tool)
         )
 
-    def _prediction(self, tool: ToolState) -> Believed:
+    def _prediction(self, tool: ToolState) -> SimulatorInput:
         """Return the state before a frame, b, and the moved grip, for a cloud without identities."""
         sheet = self._begun
         hold, before = self._grasp(Track.of_nothing(len(sheet.x)), tool)

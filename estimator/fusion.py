@@ -63,7 +63,7 @@ def fuse(
         y=jnp.asarray(np.where(known[:, None], y, start)),
         precision=jnp.asarray(precision),
         held=jnp.asarray(held),
-        force_unknown=jnp.asarray(field.widened(held)),
+        force_unknown=jnp.asarray(field.dilated(held)),
         pull=pull(before, tool, hold),
     )
     return FusedFrame(evidence=evidence, start=start)

@@ -6,7 +6,7 @@ import numpy as np
 
 from .observation import Declaration
 
-DOUBTFUL = np.log(2) / 2
+MAX_LOG_SD = np.log(2) / 2
 """Standard error of a factor's logarithm from which on it is refused: two of them are a factor of two either way."""
 WHY_NO_MEMBRANE_STIFFNESS = (
     "positions alone give only ratios: one factor on every stiffness and on the weight changes no position. "
@@ -91,7 +91,7 @@ def material(
 def _refusal(log_sd: float, *, converged: bool) -> str | None:
     if not converged:
         return "the search did not converge"
-    if log_sd < DOUBTFUL:
+    if log_sd < MAX_LOG_SD:
         return None
     return (
         f"these frames give it to a factor of {np.exp(min(2 * log_sd, MAX_LOG_FACTOR)):.2g} either way (two standard "

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from .actions import Cut, Suture
 from .errors import RecordingError
 
-UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+IDENTITY_WXYZ = np.array([1.0, 0.0, 0.0, 0.0])
 """Quaternion wxyz of the identity rotation."""
 
 

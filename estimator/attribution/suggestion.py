@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..physics.mesh import far_apart
+from ..physics.mesh import farthest_points
 from ..planning.information_config import SLANTED, UP, InformationPolicyConfig
 from .closed_frames import USUAL_GAP, ClosedFrame, FrameHistory, Timed
 from .closing import Closed
@@ -70,7 +70,7 @@ def suggest(closed: Closed, dataset: Dataset, *, log: Callable[[str], None] = la
     fits, names = [one.fitted for one in hypotheses], tuple(one.effect.name for one in hypotheses)
     log(f"searching for a pull that distinguishes {', '.join(names)}")
     rest, length, gap, radius = dataset.estimator.sheet.rest, *_typical_grasp(dataset)
-    places = far_apart(rest, InformationPolicyConfig().n_places).tolist()
+    places = farthest_points(rest, InformationPolicyConfig().n_places).tolist()
 
     def evaluate(place: int, direction: Float[np.ndarray, " 3"]) -> tuple[float, int, Float[np.ndarray, " 3"]]:
         frames = _frames(dataset, place, length * direction, gap=gap, radius=radius)

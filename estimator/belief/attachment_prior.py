@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..physics.mesh import neighbour_table, places_back, symmetric
+from ..physics.mesh import neighbour_table, reverse_places, symmetric
 from .spike_and_slab import SpikeAndSlab
 
 
@@ -46,7 +46,7 @@ class AttachmentPrior(eqx.Module):
             log_odds=jnp.full(n, np.log(probability) - np.log1p(-probability)),
             coupling=jnp.asarray(coupling, dtype=float),
             neighbours=jnp.asarray(np.where(table < 0, n, table)),
-            back=jnp.asarray(places_back(table)),
+            back=jnp.asarray(reverse_places(table)),
         )
 
     def isolated(

@@ -53,7 +53,7 @@ def _material_damping(model: SheetModel, theta: Float[Array, " 1"], context: Fra
     strain = membrane.strain(context.before[membrane.vertices])
     stiffer = (1 + more) * membrane.elasticity, (membrane.inelastic + more * strain) / (1 + more)
     stretched = model.with_term(eqx.tree_at(lambda t: (t.elasticity, t.inelastic), membrane, stiffer))
-    bent = (bending.curvature + more * bending.bent(context.before[bending.vertices])) / (1 + more)
+    bent = (bending.curvature + more * bending.curvature_at(context.before[bending.vertices])) / (1 + more)
     weighted = jnp.sqrt(1 + more) * bending.weight, jnp.sqrt(1 + more) * bent
     return stretched.with_term(eqx.tree_at(lambda t: (t.weight, t.curvature), bending, weighted))
 

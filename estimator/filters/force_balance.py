@@ -33,7 +33,7 @@ from ..physics.block_tridiagonal import (
     window_sums,
 )
 from ..physics.energy import SheetEnergy
-from ..physics.mesh import SheetMesh, neighbour_table, pattern, places_back
+from ..physics.mesh import SheetMesh, neighbour_table, pattern, reverse_places
 from .config import FilterConfig
 from .evidence import Evidence
 from .frame import Fit, Frame, FrameInformation
@@ -116,7 +116,7 @@ class ForceBalance(eqx.Module):
             energy=energy,
             tethered=Tethered.build(energy),
             neighbours=jnp.asarray(np.where(neighbours < 0, mesh.n, neighbours)),
-            back=jnp.asarray(places_back(neighbours)),
+            back=jnp.asarray(reverse_places(neighbours)),
             slots=slots,
             layout=layout,
             places=jnp.asarray(layout.pair_index(neighbours)),

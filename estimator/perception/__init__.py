@@ -7,19 +7,19 @@ images: `rectified` -> `tissue_mask`, `disparity` -> `sheet_mesh` -> (`material_
 
 from .config import PerceptionConfig
 from .disparity import Disparity, SemiGlobalMatching
-from .perception import Believed, Perception
+from .perception import Perception, SimulatorInput
 from .point_tracker import PointTracker
 from .stereo_tracker import StereoTracker
 from .tissue_mask import TissueMask, WarmTissue
 from .track import Track
 
 __all__ = [
-    "Believed",
     "Disparity",
     "Perception",
     "PerceptionConfig",
     "PointTracker",
     "SemiGlobalMatching",
+    "SimulatorInput",
     "StereoTracker",
     "TissueMask",
     "Track",

@@ -49,7 +49,7 @@ class MeshField:
         factor = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         return factor.solve(np.asarray(confidence, float)[:, None] * target)
 
-    def widened(self, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    def dilated(self, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return the chosen particles and those that share an edge with one."""
         return chosen | ((self._neighbours >= 0) & chosen[self._neighbours]).any(axis=1)
 

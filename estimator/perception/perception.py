@@ -22,7 +22,7 @@ from .stereo_tracker import StereoTracker
 from .tissue_mask import TissueMask
 from .track import Track
 
-Believed = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Grip]
+SimulatorInput = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Grip]
 """Arguments of the simulator that matches a cloud: the positions before [m], b [N/m], and the grip after the move."""
 
 
@@ -118,14 +118,18 @@ class Perception:
         return self._sheet
 
     def track(
-        self, observation: Observation, *, predicted: Float[np.ndarray, "n 3"], believed: Callable[[], Believed]
+        self,
+        observation: Observation,
+        *,
+        predicted: Float[np.ndarray, "n 3"],
+        simulator_input: Callable[[], SimulatorInput],
     ) -> Track:
         """Return the measurement of the particles in one frame.
 
         Args:
             observation: the frame.
             predicted: predicted positions of the particles [m].
-            believed: returns the arguments of the simulator; called for clouds alone.
+            simulator_input: returns the arguments of the simulator; called for clouds alone.
 
         Raises:
             PerceptionError: the frame has no usable measurement.
@@ -133,7 +137,7 @@ class Perception:
         if observation.images is not None and self._stereo is not None:
             return self._stereo.track(observation.images, observation.tool, predicted=predicted)
         points = _points(observation)
-        return self._points.track(points) if self._clouds is None else self._clouds.track(points, *believed())
+        return self._points.track(points) if self._clouds is None else self._clouds.track(points, *simulator_input())
 
     def _start_stereo(self, images: StereoPair, tool: ToolState) -> str | None:
         """Lay the mesh over a pair, and return None, or why it is skipped; with closed jaws no other pair will come."""

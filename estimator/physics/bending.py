@@ -65,7 +65,7 @@ class IsometricBending(Term):
         direct = self.weight[:, :, None] * residual[:, None, :]
         return direct - jnp.stack([second - first - by_edge, by_edge, first, -second], axis=1)
 
-    def bent(self, x: Float[Array, "h 4 3"]) -> Float[Array, " h"]:
+    def curvature_at(self, x: Float[Array, "h 4 3"]) -> Float[Array, " h"]:
         """Return the weighted sum along each hinge's normal, which is c at rest [J^(1/2)]."""
         return jnp.sum(jnp.einsum("ha,hai->hi", self.weight, x) * _normal(x, self.facing), axis=1)
 

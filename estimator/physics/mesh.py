@@ -108,7 +108,7 @@ def neighbour_table(near: sp.csr_matrix) -> Int[np.ndarray, "n p"]:
     return table
 
 
-def places_back(table: Int[np.ndarray, "n p"]) -> Int[np.ndarray, "n p"]:
+def reverse_places(table: Int[np.ndarray, "n p"]) -> Int[np.ndarray, "n p"]:
     """Return each particle's place in the rows of its neighbours, of a symmetric `neighbour_table`.
 
     Entries for the padding have no meaning.
@@ -116,7 +116,7 @@ def places_back(table: Int[np.ndarray, "n p"]) -> Int[np.ndarray, "n p"]:
     return np.argmax(table[table] == np.arange(len(table))[:, None, None], axis=2)
 
 
-def far_apart(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " _count"]:
+def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " _count"]:
     """Return indices of up to `count` points by farthest-point sampling, the first the one farthest from the mean."""
     chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
     nearest = np.linalg.norm(points - points[chosen[0]], axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..estimator import Estimator
-from ..physics.mesh import SheetMesh, far_apart
+from ..physics.mesh import SheetMesh, farthest_points
 from .information_config import DIRECTIONS, InformationPolicyConfig
 from .outcomes import outcomes
 from .plan_safety import PlanSafety
@@ -77,7 +77,7 @@ class GraspPlaces:
         """Spread places over the sheet, and keep those that the tool reaches."""
         rest = estimator.sheet.rest
         self._border = SheetMesh(rest, estimator.sheet.faces).border
-        places = far_apart(rest, self._config.n_places)
+        places = farthest_points(rest, self._config.n_places)
         assert estimator.tool is not None
         self.rates = dict.fromkeys(places[workspace.reached(rest[places], estimator.tool)].tolist(), np.inf)
 

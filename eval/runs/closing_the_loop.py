@@ -23,7 +23,7 @@ from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
 from jiggle_mj.estimator.attribution.suggestion import suggest
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
-from jiggle_mj.recording.declaration import made_by
+from jiggle_mj.recording.declaration import version_entry
 from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.truth import Truth
@@ -77,7 +77,7 @@ def close_loop(
     )
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(dataset, library=library, log=log)
-        found = made_by() | discrepancy(closed, dataset)
+        found = version_entry() | discrepancy(closed, dataset)
     sheet, name = dataset.estimator.sheet, recording.metadata.get("name", recording_path.stem)
 
     def write() -> None:

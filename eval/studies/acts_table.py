@@ -21,7 +21,7 @@ from jiggle_mj.actions import Action, Cut, Suture, Wait
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.physics.mesh import SheetMesh
 from jiggle_mj.estimator.planning.procedures import CUT_WIDTH, free_stretch, tour
-from jiggle_mj.recording.declaration import is_current, made_by
+from jiggle_mj.recording.declaration import is_current, version_entry
 from jiggle_mj.scenes import Reference, load_scene
 from jiggle_mj.scenes.scene.programme import grasp_points, programme
 from jiggle_mj.scenes.scene.scene import Scene
@@ -80,7 +80,7 @@ class ActsStudy(Study[ActsCell, list[Verdict]]):
     def run_cell(self, cell: ActsCell, path: Path) -> None:
         """Write the verdicts of all acts to the cell's file."""
         found = [vars(verdict) for verdict in self.verdicts(cell)]
-        path.write_text(json.dumps(made_by() | {"verdicts": found}, indent=1) + "\n")
+        path.write_text(json.dumps(version_entry() | {"verdicts": found}, indent=1) + "\n")
 
     def verdicts(self, cell: ActsCell) -> list[Verdict]:
         """Carry out all acts of a cell, and return the evidence about each."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from jiggle_mj.episode import ESTIMATE, RESULT, settings
 from jiggle_mj.estimator import EstimatorConfig
-from jiggle_mj.recording.declaration import made_by
+from jiggle_mj.recording.declaration import version_entry
 from jiggle_mj.recording.estimate import read_estimate
 
 from ..metrics.result_file import Json, read_result
@@ -24,7 +24,7 @@ def is_scored(folder: Path, config: EstimatorConfig) -> bool:
     if not (folder / RESULT).exists():
         return False
     figures, made_with = read_result(folder / RESULT), read_estimate(folder / ESTIMATE).metadata
-    expected = settings(config) | made_by()
+    expected = settings(config) | version_entry()
     current = all(made_with.get(name) == expected_value for name, expected_value in expected.items())
     return current and value(figures, ("detection", "n_attached")) is not None
 

@@ -22,7 +22,7 @@ from jiggle_mj.estimator.filters.build import build_filter
 from jiggle_mj.estimator.planning.information_config import InformationPolicyConfig
 from jiggle_mj.estimator.planning.outcomes import outcomes
 from jiggle_mj.estimator.planning.pull_predictor import CandidatePull, PullPredictor
-from jiggle_mj.recording.declaration import is_current, made_by
+from jiggle_mj.recording.declaration import is_current, version_entry
 
 from ..benchmark.estimator_benchmark import POINT_SD, Case, case, sl_d, timed
 from .figures import UNDEFINED
@@ -68,7 +68,7 @@ class ScalabilityStudy(Study[int, PlanTimes]):
             _, theirs = timed(sl_d(lift), repeats=REPEATS)
             _, ours = timed(our_plan(lift), repeats=REPEATS)
         times = vars(PlanTimes(sl_d_s=theirs, ours_s=ours))
-        path.write_text(json.dumps(made_by() | {"device": _device(), "times": times}, indent=1) + "\n")
+        path.write_text(json.dumps(version_entry() | {"device": _device(), "times": times}, indent=1) + "\n")
 
     def is_current(self, cell: int, path: Path) -> bool:
         """Say whether this version measured this size on this kind of device."""

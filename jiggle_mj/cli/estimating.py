@@ -8,7 +8,7 @@ from rich.table import Table
 
 from ..options import FilterName, PolicyName, Sensing
 from .options import AsJson, Disturb, Name, Out, PathArgument
-from .terminal import INTERRUPTED, console, patient, progress, show, stop
+from .terminal import INTERRUPTED, console, deferred_interrupt, progress, show, stop
 
 
 def run(
@@ -52,7 +52,7 @@ def run(
 
     scene_to_run, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)
     n_actions = most_actions(scene_to_run, policy, steps)
-    with patient() as stopped, progress(n_actions, f"run {scene_to_run.name}") as on_frame:
+    with deferred_interrupt() as stopped, progress(n_actions, f"run {scene_to_run.name}") as on_frame:
         figures = run_scene(
             scene_to_run,
             out,

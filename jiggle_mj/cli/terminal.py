@@ -35,7 +35,7 @@ def stop(failure: object, code: int) -> NoReturn:
 
 
 @contextmanager
-def patient() -> Iterator[Callable[[], bool]]:
+def deferred_interrupt() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C raises `KeyboardInterrupt`."""
     interrupts: list[int] = []
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import RecordingError
-from ..observation import UNTURNED, ToolReport, ToolState
+from ..observation import IDENTITY_WXYZ, ToolReport, ToolState
 from ..recording.schemas import NS_PER_S
 from .declaration import GraspPath, MeasuredRecording, ReportedTool, Rows
 from .point_files import read_npz, read_rows
@@ -103,7 +103,7 @@ class Tool:
             began: time at which the run began [ns].
             positions: positions of the points in the world [m].
         """
-        grasp, quat_wxyz, closed = self.given.grasp, UNTURNED, True
+        grasp, quat_wxyz, closed = self.given.grasp, IDENTITY_WXYZ, True
         if self.reports is not None:
             tip, quat_wxyz = self.reports.at(time)
             closed = time - began >= self.reports.after
@@ -132,7 +132,7 @@ def _reports(folder: Path, given: MeasuredRecording, grasp: ReportedTool, origin
             f"{archive}: {grasp.tool} must have shape (reports, 3) and {grasp.times} (reports,), increasing; they have "
             f"{positions.shape} and {seconds.shape}."
         )
-    quaternions = np.tile(UNTURNED, (count, 1))
+    quaternions = np.tile(IDENTITY_WXYZ, (count, 1))
     if grasp.orientations is not None:
         quaternions = read_npz(archive, grasp.orientations)
     if quaternions.shape != (count, 4):

@@ -33,14 +33,14 @@ def file_metadata() -> dict[str, str]:
     return {"format": FORMAT, "units": "SI (m, N, s), time in ns"} | {f"version.{p}": version(p) for p in packages}
 
 
-def made_by() -> dict[str, str]:
+def version_entry() -> dict[str, str]:
     """Return the entry of `file_metadata` that states the version of this package."""
     return {VERSION: file_metadata()[VERSION]}
 
 
 def is_current(written: Mapping[str, object]) -> bool:
-    """Return whether this version of the package wrote something that holds the entry of `made_by`."""
-    return written.get(VERSION) == made_by()[VERSION]
+    """Return whether this version of the package wrote something that holds the entry of `version_entry`."""
+    return written.get(VERSION) == version_entry()[VERSION]
 
 
 def identity(*parts: object) -> str:

@@ -22,7 +22,7 @@ from jaxtyping import Float, UInt8
 
 from ..camera import CameraCalibration, matrix_from_quaternion, rounded_quaternion
 from ..errors import RecordingError
-from ..observation import UNTURNED, ToolState
+from ..observation import IDENTITY_WXYZ, ToolState
 
 WORLD = "world"
 """Name of the world frame."""
@@ -189,7 +189,7 @@ def parse_transform(message: FrameTransform | Pose) -> Float[np.ndarray, "4 4"]:
     position = np.array([translation.x, translation.y, translation.z])
     quat_wxyz = np.array([rotation.w, rotation.x, rotation.y, rotation.z])
     if not quat_wxyz.any():
-        quat_wxyz = UNTURNED
+        quat_wxyz = IDENTITY_WXYZ
     refuse_bad_pose(position, quat_wxyz)
     T = np.eye(4)
     T[:3, :3] = matrix_from_quaternion(quat_wxyz)
@@ -292,7 +292,9 @@ def parse_points(message: PointCloud, topic: str) -> dict[str, np.ndarray]:
     return {name: table[name].copy() for name in known}
 
 
-def fill_pose(pose: Pose, position: Float[np.ndarray, " 3"], quat_wxyz: Float[np.ndarray, " 4"] = UNTURNED) -> None:
+def fill_pose(
+    pose: Pose, position: Float[np.ndarray, " 3"], quat_wxyz: Float[np.ndarray, " 4"] = IDENTITY_WXYZ
+) -> None:
     """Set every field of a pose, zeros included: a viewer treats an unset part as a missing one."""
     _fill(pose.position, "xyz", position)
     _fill(pose.orientation, "wxyz", quat_wxyz)

@@ -10,7 +10,7 @@ from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.identification import Identification, identify
 from jiggle_mj.estimator.physics.ratios import ratios, scaled
 from jiggle_mj.estimator.physics.surrogate import surrogate
-from jiggle_mj.material import DOUBTFUL, material
+from jiggle_mj.material import MAX_LOG_SD, material
 from tests.support.small_sheet import DECLARATION, attached, follow, lifts, observed, sheet, sheet_energy, sheet_filter
 
 WEIGHT, BENDING = 0.6, 1.7
@@ -71,7 +71,7 @@ def test_the_truth_is_found_within_its_standard_errors(runs):
 
 @pytest.mark.slow
 def test_standard_errors_are_small(runs):
-    assert all(run.log_sd["weight"] < 0.1 and run.log_sd["bending"] < DOUBTFUL for run in runs)
+    assert all(run.log_sd["weight"] < 0.1 and run.log_sd["bending"] < MAX_LOG_SD for run in runs)
 
 
 @pytest.mark.slow

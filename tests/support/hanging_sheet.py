@@ -5,7 +5,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from jiggle_mj.observation import UNTURNED, Declaration, MeasuredPoints, Observation, ToolReport, ToolState
+from jiggle_mj.observation import IDENTITY_WXYZ, Declaration, MeasuredPoints, Observation, ToolReport, ToolState
 from jiggle_mj.scenes.scene.scene import BedConfig, Scene, TissueConfig
 from jiggle_mj.scenes.tissue.jaws import Jaws
 from jiggle_mj.scenes.tissue.model import build_tissue
@@ -78,7 +78,7 @@ def recording(grasps: int, seed: int) -> list[Observation]:
         points = MeasuredPoints(positions=x + NOISE * rng.normal(size=x.shape), track_id=np.arange(len(x)), sd=NOISE)
         tool = ToolState(
             position=tip,
-            quat_wxyz=UNTURNED,
+            quat_wxyz=IDENTITY_WXYZ,
             closed=grasp > 0,
             grasp=grasp,
             radius=0.01,

@@ -38,3 +38,18 @@ def home(target: str, known: Iterable[str]) -> str | None:
     """The module that an imported name is, or is in."""
     parents = (target, target.rpartition(".")[0])
     return next((name for name in parents if name in known), None)
+
+
+TEXT = {".py", ".md", ".toml", ".html", ".js", ".css", ".json", ".cff", ".xml"}
+"""Suffixes of the files that people read."""
+UNREAD = {".git", ".venv", "build", "dist", "out", "__pycache__"}
+"""Folders that a checkout collects and nobody wrote."""
+
+
+def tracked_text() -> Iterator[tuple[Path, str]]:
+    """Yield every text file that people wrote, and what it holds."""
+    for path in sorted(ROOT.rglob("*")):
+        parts = set(path.relative_to(ROOT).parts[:-1])
+        named = path.suffix in TEXT or path.name in ("Makefile", "run")
+        if named and path.is_file() and not parts & UNREAD and not any(part.startswith(".venv") for part in parts):
+            yield path, path.read_text(encoding="utf-8")

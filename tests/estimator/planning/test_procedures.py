@@ -71,7 +71,11 @@ class KnownFactors(Estimator):
     """Estimator that believes that all is free, with given log Bayes factors of a suture after each step."""
 
     def __init__(self, factors):
-        self.changes, self.factors = [], list(factors)
+        self.known, self.factors = [], list(factors)
+
+    @property
+    def changes(self):
+        return self.known
 
     @property
     def sheet(self):

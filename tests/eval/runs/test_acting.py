@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jiggle_mj.actions import Action, Grasp, Move, Release, Wait
-from jiggle_mj.cli.terminal import patient
+from jiggle_mj.cli.terminal import deferred_interrupt
 from jiggle_mj.errors import ActionError, OptionError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.planning.information_config import InformationPolicyConfig
@@ -180,7 +180,7 @@ def test_a_run_that_is_stopped_writes_what_it_has(scene, tmp_path):
 
 def test_the_first_interrupt_ends_the_run_and_the_second_stops_at_once():
     before = signal.getsignal(signal.SIGINT)
-    with patient() as stopped:
+    with deferred_interrupt() as stopped:
         assert not stopped()
         signal.raise_signal(signal.SIGINT)
         assert stopped()

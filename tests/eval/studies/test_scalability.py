@@ -6,7 +6,7 @@ import jax
 import pytest
 
 from jiggle_mj.eval.studies.scalability import PRINTED, PlanTimes, ScalabilityStudy
-from jiggle_mj.recording.declaration import made_by
+from jiggle_mj.recording.declaration import version_entry
 
 DEVICE = jax.devices()[0].device_kind
 
@@ -20,7 +20,7 @@ def test_each_size_has_its_line_and_the_papers_seconds_where_there_are_any():
 
 @pytest.mark.parametrize(("device", "current"), [(DEVICE, True), ("another", False)])
 def test_times_are_kept_for_the_kind_of_device_that_they_were_measured_on(tmp_path, device, current):
-    kept = made_by() | {"device": device, "times": {"sl_d_s": 1.5, "ours_s": 0.5}}
+    kept = version_entry() | {"device": device, "times": {"sl_d_s": 1.5, "ours_s": 0.5}}
     (tmp_path / "600.json").write_text(json.dumps(kept))
     study = ScalabilityStudy()
     assert study.is_current(600, tmp_path / "600.json") is current
