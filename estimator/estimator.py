@@ -111,7 +111,7 @@ class Estimator:
             self._change(event, observation.index)
         if not tool.closed:
             self._release()
-            self._grip.open()
+            self._grip.release()
             self._open_frame = observation
             return None
         if self._grip.begins(tool):

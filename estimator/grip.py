@@ -75,7 +75,7 @@ class GripTracker:
     closing: ToolState | None = None
     """The tool when the jaws closed; None while they are open, or where that is not known."""
 
-    def open(self) -> None:
+    def release(self) -> None:
         """Let go."""
         self.hold = self.closing = None
 

@@ -13,7 +13,7 @@ from jiggle_mj.observation import Declaration
 from jiggle_mj.sheet_triangulation import SheetPlane
 
 from .config import EstimatorConfig
-from .filters.build import build_filter
+from .filter_builder import build_filter
 from .filters.filter import Filter, FilterState
 from .perception.mesh_field import MeshField
 from .physics.mesh import SheetMesh

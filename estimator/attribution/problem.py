@@ -11,7 +11,7 @@ from ..belief.attachment_belief import AttachmentBelief
 from ..belief.prior import prior_belief
 from ..effects.effect import Effect
 from ..effects.sheet_model import centred, nominal_energy
-from ..filters.build import force_balance
+from ..filter_builder import force_balance
 from ..physics.mesh import SheetMesh
 from .closed_frames import FrameHistory
 from .dataset import Dataset

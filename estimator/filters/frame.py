@@ -50,11 +50,11 @@ class FrameInformation(eqx.Module):
     """A frame's evidence about s in information form, its state eliminated."""
 
     precision: Float[Array, "n n"]
-    """D^T N^-1 D."""
+    """Precision of s, D^T N^-1 D."""
     score: Float[Array, " n"]
     """-D^T N^-1 e with e = r + H (y - x): the gradient of the log likelihood at the s of the linearisation."""
     chi2: Float[Array, ""]
-    """e^T N^-1 e."""
+    """Squared whitened residual, e^T N^-1 e."""
     at: Float[Array, " n"]
     """s of the linearisation."""
 

@@ -22,7 +22,7 @@ class GraspFrame(eqx.Module):
     """Bounded stiffnesses of the linearisation [1]."""
 
 
-class Grasp(eqx.Module):
+class GraspFrames(eqx.Module):
     """The frames between closing and opening the jaws, and their evidence about s in information form."""
 
     frames: tuple[GraspFrame, ...]
@@ -38,7 +38,7 @@ class Grasp(eqx.Module):
     """Sum of the frames' residuals; None where they were not linearised again."""
 
     @classmethod
-    def empty(cls, n: int, noise: Noise | None = None) -> "Grasp":
+    def empty(cls, n: int, noise: Noise | None = None) -> "GraspFrames":
         """Return a grasp of n particles without frames."""
         return cls(frames=(), precision=jnp.zeros((n, n)), shift=jnp.zeros(n), noise=noise, residuals=None)
 
@@ -48,10 +48,10 @@ class Grasp(eqx.Module):
         x: Float[Array, "n 3"],
         information: FrameInformation,
         residuals: ForceResiduals | None = None,
-    ) -> "Grasp":
+    ) -> "GraspFrames":
         """Return the grasp with one frame more."""
         before = self.residuals
-        return Grasp(
+        return GraspFrames(
             frames=(*self.frames, GraspFrame(evidence=evidence, x=x, s=information.at)),
             precision=self.precision + information.precision,
             shift=self.shift + information.shift,
@@ -63,9 +63,9 @@ class Grasp(eqx.Module):
         """Return the largest change of any s since a frame was linearised [1]."""
         return max(float(jnp.max(jnp.abs(s - frame.s))) for frame in self.frames)
 
-    def relinearised(self, balance: ForceBalance, s: Float[Array, " n"], noise: Noise) -> "Grasp":
+    def relinearised(self, balance: ForceBalance, s: Float[Array, " n"], noise: Noise) -> "GraspFrames":
         """Return the same frames linearised at s with the given noise, each searched from the state found before."""
-        grasp, balance = Grasp.empty(len(s), noise), balance.inflated(noise.force)
+        grasp, balance = GraspFrames.empty(len(s), noise), balance.inflated(noise.force)
 
         def relinearise(k: int) -> tuple[Float[Array, "n 3"], FrameInformation, ForceResiduals]:
             evidence = self.frames[k].evidence.inflated(noise.position)

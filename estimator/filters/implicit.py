@@ -27,7 +27,7 @@ from .evidence import Evidence
 from .filter import FilterState, ForceBalanceFilter, Region
 from .force_balance import ForceBalance
 from .frame import Frame, FrameInformation
-from .grasp import Grasp, linearise
+from .grasp import GraspFrames, linearise
 from .noise import Noise
 from .posterior_summary import Convergence, PosteriorSummary, Update, prior_summary
 
@@ -39,7 +39,7 @@ class ImplicitState(FilterState):
     """The balance of forces with the assumed noise, and with the sheet's parameters as identified so far."""
     noise: Noise
     """Factors on the assumed variances, as learned so far."""
-    grasps: tuple[Grasp, ...]
+    grasps: tuple[GraspFrames, ...]
     """The grasps since the last cut or suture."""
     earlier_precision: Float[Array, "n n"]
     """Precision of s by the frames before the last cut or suture, which are not linearised again."""
@@ -123,7 +123,7 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
         update = _updated(balance, state.belief, frame, information, inflated)
         if not update.explains_the_frame:
             return state, update
-        *before, last = (*state.grasps, Grasp.empty(len(s))) if state.between_grasps else state.grasps
+        *before, last = (*state.grasps, GraspFrames.empty(len(s))) if state.between_grasps else state.grasps
         grasps = (*before, last.with_frame(evidence, update.x, information))
         return replace(state, summary=update, grasps=grasps, between_grasps=False), update
 

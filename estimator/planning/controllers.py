@@ -64,7 +64,7 @@ class Scales(eqx.Module):
     """Scales by which the terms of a loss are divided."""
 
     displacement: Float[Array, ""]
-    """D_1cm [m N^2/m^2]."""
+    """Typical size of the displacement objective after a pull of 1 cm, D_1cm [m N^2/m^2]."""
     energy: Float[Array, ""]
     """U_max, the limit of the mean boundary energy [J]."""
     noise: Float[Array, ""]

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.estimator.blas import one_thread
-from jiggle_mj.estimator.filters.build import build_filter
+from jiggle_mj.estimator.filter_builder import build_filter
 from jiggle_mj.estimator.filters.evidence import Evidence, Pull
 from jiggle_mj.estimator.filters.filter import Filter
 from jiggle_mj.estimator.physics.energy import SheetEnergy

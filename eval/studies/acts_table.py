@@ -153,9 +153,9 @@ def log_bayes_factor_after(
     return estimator.change_log_bayes_factor(estimator.changes[-1]) or 0.0
 
 
-def limit(worked: Float[np.ndarray, " k"]) -> float:
+def limit(successful: Float[np.ndarray, " k"]) -> float:
     """Return the log Bayes factor below which at most `FALSE_ALARM_RATE` of the acts that worked lie [nat]."""
-    return float(np.quantile(worked, FALSE_ALARM_RATE, method="lower"))
+    return float(np.quantile(successful, FALSE_ALARM_RATE, method="lower"))
 
 
 def _acts(scene: Scene, estimator: Estimator, rng: np.random.Generator, count: int) -> Iterator[Cut | Suture]:
@@ -181,10 +181,10 @@ def _observe(reference: Reference, estimator: Estimator, actions: Iterator[Actio
 def _counts(found: list[Verdict]) -> Iterator[str]:
     """Yield the three cells of each kind of act."""
     for kind in KINDS:
-        worked, failed = (
+        successful, failed = (
             np.array([verdict.log_bayes_factor for verdict in found if verdict.kind == kind and verdict.works is works])
             for works in (True, False)
         )
-        yield f"{(worked <= 0).sum()} of {len(worked)}"
+        yield f"{(successful <= 0).sum()} of {len(successful)}"
         yield f"{(failed <= 0).sum()} of {len(failed)}"
-        yield f"{(failed < limit(worked)).sum()} of {len(failed)}" if len(worked) else "none worked"
+        yield f"{(failed < limit(successful)).sum()} of {len(failed)}" if len(successful) else "none worked"

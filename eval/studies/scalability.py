@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.config import EstimatorConfig
-from jiggle_mj.estimator.filters.build import build_filter
+from jiggle_mj.estimator.filter_builder import build_filter
 from jiggle_mj.estimator.planning.information_config import InformationPolicyConfig
 from jiggle_mj.estimator.planning.outcomes import outcomes
 from jiggle_mj.estimator.planning.pull_predictor import CandidatePull, PullPredictor

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import jiggle_mj
-from tests.support.sources import ROOT, home, imports, modules
+from tests.support.sources import FOLDERS, ROOT, home, imports, modules
 
 LAYER = {
     "jiggle_mj.cli": "cli",
@@ -119,6 +119,21 @@ def import_graph() -> dict[str, set[str]]:
 def test_no_file_imports_itself_through_others():
     """`graphlib` raises CycleError, which names the files, where the imports of any go in a circle."""
     TopologicalSorter(import_graph()).prepare()
+
+
+def room(module: str) -> str:
+    """The folder that a module is in, below its package; a module of the package itself is a room of its own."""
+    package = next((found for found in FOLDERS.values() if module.startswith(f"{found}.") and found != "jiggle_mj"), "")
+    inside = module.removeprefix(f"{package or 'jiggle_mj'}.").split(".")
+    return f"{package or 'jiggle_mj'}.{inside[0]}"
+
+
+def test_no_folder_imports_itself_through_others():
+    """The same of folders: of two that know each other neither can be read, or moved, without the other."""
+    graph: dict[str, set[str]] = {}
+    for name, targets in import_graph().items():
+        graph.setdefault(room(name), set()).update(room(target) for target in targets)
+    TopologicalSorter({own: targets - {own} for own, targets in graph.items()}).prepare()
 
 
 def test_a_circle_of_imports_is_found():

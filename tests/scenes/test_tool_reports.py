@@ -10,7 +10,7 @@ from jiggle_mj.scenes.disturbances.registry import disturbed
 from jiggle_mj.scenes.sensing.observer import REPORT_PERIOD
 
 LATENCY = 0.2
-"""Of the late tool [s]."""
+"""Delay of the late tool [s]."""
 
 
 def test_reports_are_periodic_and_as_late_as_the_tool():

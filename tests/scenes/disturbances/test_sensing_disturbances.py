@@ -201,7 +201,7 @@ def test_lost_frames_are_missing_from_recording_and_truth_alike(tmp_path):
 
 
 def test_repeated_frames_show_the_frame_before_at_a_new_time():
-    """Of the 29 frames after the first, 14.5 +- 2.7 are repeats; 5 to 25 is over 3 sd."""
+    """Repeats make up 14.5 +- 2.7 of the 29 frames after the first; 5 to 25 is over 3 sd."""
     reference = made("frame_repeat=0.5")
     seen = [reference.step(Wait()) for _ in range(30)]
     same = sum(np.array_equal(positions(a), positions(b)) for a, b in pairwise(seen))

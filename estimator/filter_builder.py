@@ -4,20 +4,20 @@ from typing import Any
 
 from jiggle_mj.observation import Declaration
 
-from ..belief.boundary_belief import BoundaryBelief
-from ..belief.prior import prior_belief
-from ..config import EstimatorConfig
-from ..physics.energy import SheetEnergy
-from ..physics.mesh import SheetMesh
-from ..physics.simulator import simulator
-from ..physics.surrogate import surrogate
-from .adam import RATE, AdamShooting
-from .explicit import PRIOR_MEAN, MultipleShooting
-from .filter import Filter
-from .force_balance import ForceBalance
-from .implicit import ImplicitFilter
-from .nnls import NonNegativeLeastSquares
-from .unscented import ReducedUnscented
+from .belief.boundary_belief import BoundaryBelief
+from .belief.prior import prior_belief
+from .config import EstimatorConfig
+from .filters.adam import RATE, AdamShooting
+from .filters.explicit import PRIOR_MEAN, MultipleShooting
+from .filters.filter import Filter
+from .filters.force_balance import ForceBalance
+from .filters.implicit import ImplicitFilter
+from .filters.nnls import NonNegativeLeastSquares
+from .filters.unscented import ReducedUnscented
+from .physics.energy import SheetEnergy
+from .physics.mesh import SheetMesh
+from .physics.simulator import simulator
+from .physics.surrogate import surrogate
 
 FORCE_LEVEL = 0.07
 """Sum of the forces that meet at a particle for which `EstimatorConfig.force_sd` is the model's force error
