@@ -12,6 +12,8 @@ help:
 	@echo "make check   format, lint, types and tests"
 	@echo "make format  rewrite the sources in the house's format"
 	@echo "make slow    the tests that take minutes"
+	@echo "make defaults  tests whose claim is about bits, compiled with XLA's default flags"
+	@echo "make versions  the fast tests with each newer Python that this machine has"
 	@echo "make lock    resolve the dependencies anew into the two lock files"
 	@echo "make clean   remove what was built; make distclean also removes $(VENV)"
 
@@ -26,6 +28,19 @@ demo: $(SET_UP)
 
 test: $(SET_UP)
 	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
+
+# All other tests compile without optimisation, for speed: what they say of bits holds for another program.
+defaults: $(SET_UP)
+	XLA_FLAGS= $(BIN)/pytest -m "bits and not slow"
+
+# PYTHONS names them: those on PATH, and pyenv's.
+PYTHONS ?= $(foreach v,3.12 3.13,$(firstword $(wildcard $(HOME)/.pyenv/versions/$(v).*/bin/python) $(shell command -v python$(v))))
+
+versions:
+	@test -n "$(strip $(PYTHONS))" || echo "versions: no Python newer than this one is installed; nothing was tested"
+	for python in $(PYTHONS); do \
+	  $(MAKE) PYTHON=$$python VENV=build/venv-$$(basename $$(dirname $$(dirname $$python))) test || exit 1; \
+	done
 
 slow: $(SET_UP)
 	$(BIN)/pytest -m slow
@@ -60,4 +75,4 @@ clean:
 distclean: clean
 	rm -rf $(VENV)
 
-.PHONY: help setup demo test slow check lint types format lock clean distclean
+.PHONY: help setup demo test slow defaults versions check lint types format lock clean distclean

@@ -13,8 +13,6 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float
 
 from .gaussian_information import Gaussian, GaussianInformation
-from .gaussian_information import entropy as entropy
-from .gaussian_information import standard_deviations as standard_deviations
 
 RELATIVE_TOLERANCE = 1e-12
 """Violation of a condition of optimality that counts as rounding, over the largest scaled shift."""

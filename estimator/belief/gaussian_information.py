@@ -235,11 +235,6 @@ def variances(factor: Float[Array, "n n"]) -> Float[Array, " n"]:
     return jnp.sum(lower_inverse(factor) ** 2, axis=0)
 
 
-def standard_deviations(factor: Float[Array, "n n"]) -> Float[Array, " n"]:
-    """Return the square roots of the diagonal of (L L^T)^-1."""
-    return jnp.sqrt(variances(factor))
-
-
 def _covariance(factor: Float[Array, "n n"], kept: Int[HostArray, " k"] | None = None) -> Float[Array, "k k"]:
     """Return (L L^T)^-1 of some variables, by products: they run several times faster than triangular solves."""
     inverse = lower_inverse(factor)

@@ -23,12 +23,12 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jiggle_mj.options import FilterName
 
-from ..belief.boundary_belief import BoundaryBelief, entropy, standard_deviations
+from ..belief.boundary_belief import BoundaryBelief
+from ..belief.gaussian_information import Gaussian
 from ..physics.simulator import SWEEPS_PER_STEP
 from ..physics.xpbd import XPBD
 from .evidence import Evidence
@@ -83,18 +83,18 @@ class MultipleShooting(GaussianFilter[ShootingState]):
         before = state.summary.belief
         assert isinstance(before, BoundaryBelief)
         history, shots = state.history.with_step(evidence, grip_stiffness=self.grip_stiffness).draw(self.samples)
-        belief, factor, nis = update(self.simulator, before, state.summary.b, shots, sweeps=SWEEPS_PER_STEP)
+        belief, gaussian, nis = update(self.simulator, before, state.summary.b, shots, sweeps=SWEEPS_PER_STEP)
         b = non_negative(belief, state.summary.b)
-        usable = are_finite(factor, nis)
+        usable = are_finite(gaussian.factor, nis)
         if not usable:
             b = unavailable(b)
         outcome = Update(
             belief=belief,
             x=evidence.y,
             b=b,
-            sd=standard_deviations(factor),
+            sd=gaussian.sd,
             probability=unavailable(b),
-            entropy=entropy(factor),
+            entropy=gaussian.entropy(),
             nis=nis,
             convergence=Convergence.CONVERGED.code,
         )
@@ -106,8 +106,8 @@ class MultipleShooting(GaussianFilter[ShootingState]):
 @eqx.filter_jit
 def update(
     simulator: XPBD, belief: BoundaryBelief, b: Float[Array, " n"], shots: Shots, *, sweeps: int
-) -> tuple[BoundaryBelief, Float[Array, "n n"], Float[Array, ""]]:
-    """Return the belief after all samples together, the Cholesky factor of its precision, and the NIS.
+) -> tuple[BoundaryBelief, Gaussian, Float[Array, ""]]:
+    """Return the belief after all samples together, the same with its precision factorised, and the NIS.
 
     The NIS is the squared innovation per degree of freedom.
 
@@ -132,10 +132,10 @@ def update(
 
     precision, score, chi2 = (jnp.sum(part, axis=0) for part in jax.lax.map(evidence_of, shots))
     after = belief.add(precision, score + precision @ (b + beyond))
-    factor = jnp.linalg.cholesky(after.precision)
-    explained = score @ cho_solve((factor, True), score)
+    gaussian = after.gaussian()
+    explained = score @ gaussian.solve(score)
     observed = 3 * jnp.sum(jnp.trace(shots.precision, axis1=2, axis2=3) > 0)
-    return after, factor, (chi2 - explained) / jnp.maximum(observed, 1).astype(b.dtype)
+    return after, gaussian, (chi2 - explained) / jnp.maximum(observed, 1).astype(b.dtype)
 
 
 @eqx.filter_jit

@@ -13,13 +13,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.options import FilterName
 
 from ..belief.attachment_belief import AttachmentBelief
+from ..belief.gaussian_information import Gaussian
 from ..belief.topology import Change, after
 from ..physics.energy import SheetEnergy
 from .config import FilterConfig, SamplingConfig
@@ -283,7 +283,7 @@ def _updated(
     """Return the belief after a frame's evidence, and the state for it."""
     belief = belief.add(information.precision, information.shift)
     gaussian = belief.gaussian()
-    nis = _normalised_innovation(information, gaussian.factor, evidence)
+    nis = _normalised_innovation(information, gaussian, evidence)
     belief = belief.sweep(gaussian)
     summary = _summary(belief, Convergence.SEARCH_CUT_OFF.unless(frame.converged))
     x = balance.polish(frame, belief.bounded(summary.b), evidence)
@@ -329,15 +329,13 @@ def _summary(belief: AttachmentBelief, convergence: Int[Array, ""]) -> Posterior
     )
 
 
-def _normalised_innovation(
-    information: FrameInformation, factor: Float[Array, "n n"], evidence: Evidence
-) -> Float[Array, ""]:
+def _normalised_innovation(information: FrameInformation, gaussian: Gaussian, evidence: Evidence) -> Float[Array, ""]:
     """Return e^T (N + D Sigma D^T)^-1 e per degree of freedom, Sigma before the frame and e at the s of then.
 
-    By Woodbury's identity it is e^T N^-1 e - p^T (Sigma^-1 + D^T N^-1 D)^-1 p with p = D^T N^-1 e; `factor` is the
-    Cholesky factor of the middle matrix.
+    By Woodbury's identity it is e^T N^-1 e - p^T (Sigma^-1 + D^T N^-1 D)^-1 p with p = D^T N^-1 e; `gaussian` has
+    the middle matrix as its covariance.
     """
-    explained = information.score @ cho_solve((factor, True), information.score)
+    explained = information.score @ gaussian.solve(information.score)
     observed = 3 * jnp.sum(evidence.seen)
     degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.force_unknown), 1)
     return (information.chi2 - explained) / degrees.astype(explained.dtype)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jiggle_mj.options import FilterName
 
-from ..belief.boundary_belief import BoundaryBelief, entropy, standard_deviations
+from ..belief.boundary_belief import BoundaryBelief
 from ..physics.energy import SheetEnergy
 from .evidence import Evidence
 from .filter import FilterState, GaussianFilter
@@ -97,7 +97,7 @@ def _updated(
     mean = belief.mean()
     chi2 = weight * jnp.sum((force + mean[:, None] * d) ** 2, axis=1)
     after = belief.add(jnp.diag(precision), shift)
-    factor = jnp.linalg.cholesky(after.precision)
+    gaussian = after.gaussian()
     score = shift - precision * mean
     explained = jnp.sum(score**2 / jnp.diagonal(after.precision))
     degrees = 3 * jnp.maximum(jnp.sum(weight > 0), 1).astype(b.dtype)
@@ -105,9 +105,9 @@ def _updated(
         belief=after,
         x=x,
         b=after.non_negative_mean(b > 0),
-        sd=standard_deviations(factor),
+        sd=gaussian.sd,
         probability=unavailable(b),
-        entropy=entropy(factor),
+        entropy=gaussian.entropy(),
         nis=(jnp.sum(chi2) - explained) / degrees,
         convergence=Convergence.SEARCH_CUT_OFF.unless(smooth.converged),
     )

@@ -22,13 +22,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve, solve_triangular
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy.cluster.vq import kmeans2
 
 from jiggle_mj.options import FilterName
 
-from ..belief.boundary_belief import BoundaryBelief, entropy, non_negative_minimum
+from ..belief.boundary_belief import BoundaryBelief, non_negative_minimum
 from ..physics.energy import SheetEnergy
 from ..physics.environment import Grip
 from ..physics.equilibrium import equilibrium
@@ -136,7 +136,7 @@ class ReducedUnscented(GaussianFilter[UnscentedState]):
             b=theta[patch],
             sd=jnp.sqrt(variance[patch]),
             probability=unavailable(state.summary.b),
-            entropy=entropy(jnp.linalg.cholesky(marginals.precision)),
+            entropy=marginals.entropy(),
             nis=nis,
             convergence=Convergence.SEARCH_CUT_OFF.unless(converged),
         )
@@ -188,7 +188,7 @@ def update(
     residual = jnp.where(evidence.seen[:, None], evidence.y - centre, 0.0)
     precision, score = jnp.einsum("ani,bni->ab", weighted, slope), jnp.einsum("ani,ni->a", weighted, residual)
     after = state.add(precision, score + precision @ mean)
-    explained = score @ cho_solve((jnp.linalg.cholesky(after.precision), True), score)
+    explained = score @ after.gaussian().solve(score)
     chi2 = jnp.einsum("ni,nij,nj->", residual, evidence.precision, residual)
     observed = 3 * jnp.maximum(jnp.sum(evidence.seen), 1)
     nis = (chi2 - explained) / observed.astype(mean.dtype)

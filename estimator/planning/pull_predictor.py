@@ -22,12 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from ..belief.attachment_belief import AttachmentBelief, Gaussian
+from ..belief.attachment_belief import AttachmentBelief
+from ..belief.gaussian_information import Gaussian, GaussianInformation
 from ..belief.spike_and_slab import Mixture
 from ..estimator import Estimator
 from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
-from ..physics.block_tridiagonal import lower_inverse
 
 QUADRATURE_NODES = 5
 """Gauss-Hermite nodes for each normal of a mixture."""
@@ -158,17 +158,18 @@ class PullPredictor(eqx.Module):
 
         def draw(state: Int[Array, " n"], noise: Float[Array, " n"]) -> Float[Array, " n"]:
             precision = prior.sd[state] ** -2
-            factor = jnp.linalg.cholesky(belief.precision + jnp.diag(precision))
-            mean = jax.scipy.linalg.cho_solve((factor, True), belief.shift + prior.mean[state] * precision)
-            s = mean + jax.scipy.linalg.solve_triangular(factor.T, noise, lower=False)
+            given = GaussianInformation(
+                precision=belief.precision + jnp.diag(precision), shift=belief.shift + prior.mean[state] * precision
+            )
+            s = given.sample(noise)
             return jnp.where(state > 0, jnp.clip(s, 0, largest), 0.0)
 
         return jax.lax.map(lambda drawn: draw(*drawn), (states, noise))
 
     def gain(self, precision: Float[Array, "n n"]) -> Float[Array, ""]:
         """Return the expected fall of the entropy of the s asked about, by evidence of that precision [nat]."""
-        before = self.belief.precision + jnp.diag(self.belief.site_precision)
-        variance = jnp.sum(lower_inverse(jnp.linalg.cholesky(before + precision)) ** 2, axis=0)
+        before = self.belief.information
+        variance = GaussianInformation(precision=before.precision + precision, shift=before.shift).variances()
         noise = 1 / jnp.maximum(1 / variance - 1 / self.variance, MIN_PRECISION)
         return jnp.sum(jnp.where(self.about, expected_fall(self.mixture, noise), 0.0))
 

@@ -8,7 +8,6 @@ import tyro
 PathArgument = Annotated[Path, tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
 RowsName = Literal["inside", "together", "images", "outside", "nothing"]
-TableName = Literal["main", "active", "acts", "undeclared", "scalability", "simulation", "one-lift"]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 AsJson = Annotated[bool, tyro.conf.arg(name="json")]
 Disturb = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[=MAGNITUDE]")]]

@@ -85,6 +85,7 @@ def test_open_jaws_between_grasps_give_no_estimate(run):
     assert estimator.skipped == []
 
 
+@pytest.mark.bits
 def test_the_same_input_gives_the_same_bytes():
     def estimates() -> list:
         estimator = Estimator(DECLARATION)

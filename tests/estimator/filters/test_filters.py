@@ -90,6 +90,7 @@ def run(filter: Filter, frames: list[Evidence]) -> tuple[FilterState, list[Updat
     return state, outcomes
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("make", MOSTLY_QUICK)
 def test_every_filter_sharpens_stays_non_negative_and_repeats_itself(make):
     """Adam gives no uncertainty; the others lower the entropy with every frame."""

@@ -139,6 +139,7 @@ def test_a_sheet_that_fell_back_is_found_at_rest():
     assert np.sqrt(np.nanmean(np.sum((fallen.positions - sheet.rest) ** 2, axis=1))) < MAX_RMS
 
 
+@pytest.mark.bits
 def test_the_same_images_give_the_same_bytes():
     def bytes_of_a_run():
         tracker, sheet = started()
