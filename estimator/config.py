@@ -5,6 +5,7 @@ from typing import Literal, get_args
 
 from jiggle_mj.options import FilterName
 
+from .belief.config import BeliefConfig
 from .belief.prior import PriorConfig
 from .filters.config import FilterConfig, SamplingConfig
 from .perception.config import PerceptionConfig
@@ -73,6 +74,8 @@ class EstimatorConfig:
     """Numbers of samples of the filter 'implicit'."""
     prior: PriorConfig = field(default_factory=PriorConfig)
     """Numbers of the prior of the filter 'implicit'."""
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    """Numbers of the belief of the filter 'implicit', and of its sampler."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -72,7 +72,7 @@ class Estimator:
             disparity=disparity,
         )
         self._grip = GripTracker()
-        self._sheet: TrackedSheet | None = None
+        self._tracked_or_none: TrackedSheet | None = None
         self._open_frame: Observation | None = None
         self._tool: ToolState | None = None
         self._seen_precision = np.eye(3) * INITIAL_POINT_SD**-2
@@ -101,7 +101,7 @@ class Estimator:
     def _update(self, observation: Observation) -> Estimate | None:
         """Prepare the grasp of a frame, then run it through perception, grip, fusion and filter."""
         tool = self._tool = observation.tool
-        if self._sheet is None:
+        if self._tracked_or_none is None:
             if (passed_over := self._perception.look_at_rest(observation)) is not None:
                 self.skipped.append((observation.index, passed_over))
             if not (tool.closed or observation.events):
@@ -117,29 +117,30 @@ class Estimator:
         if self._grip.begins(tool):
             self._release()
             self._grip.closing = tool
-        sheet, began = self._begun, time.perf_counter()
+        tracked, began = self._tracked, time.perf_counter()
         track = self._see(observation)
         seen = time.perf_counter()
         if not track.visible.any():
             self.skipped.append((observation.index, "no particle was seen"))
             return None
         hold, before = self._grasp(track, tool)
-        frame = fuse(track, hold, tool, before, grip_sd=self.config.grip_sd, field=sheet.field)
-        self._slip, self._seen_precision = hold.slip(track, tool), track.precision[track.visible].mean(axis=0)
-        sheet.state, update = sheet.filter.update(sheet.state, frame.evidence, jnp.asarray(frame.start))
+        frame = fuse(track, hold, tool, before, grip_sd=self.config.grip_sd, field=tracked.field)
+        self._slip = frame.slip
+        self._seen_precision = track.precision[track.visible].mean(axis=0)
+        tracked.state, update = tracked.filter.update(tracked.state, frame.evidence, jnp.asarray(frame.start))
         if not update.explains_the_frame:
             raise PerceptionError(
                 f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
             )
-        self._grip.hold, sheet.x = hold, np.asarray(update.x)
+        self._grip.hold, tracked.x = hold, np.asarray(update.x)
         if self.config.refinement == "frames":
-            sheet.state = sheet.filter.resample(sheet.state)
-        summary = sheet.state.summary
+            tracked.state = tracked.filter.resample(tracked.state)
+        summary = tracked.state.summary
         b = np.asarray(summary.b)
         return Estimate(
             index=observation.index,
             time=observation.time,
-            positions=sheet.x,
+            positions=tracked.x,
             observed=track.positions,
             mean=b,
             sd=np.asarray(summary.sd),
@@ -147,7 +148,7 @@ class Estimator:
             held=hold.held,
             entropy=float(summary.entropy),
             nis=float(update.nis),
-            boundary_energy=0.5 * float(np.mean(b * np.sum((sheet.x - self.sheet.rest) ** 2, axis=1))),
+            boundary_energy=0.5 * float(np.mean(b * np.sum((tracked.x - self.sheet.rest) ** 2, axis=1))),
             update_s=time.perf_counter() - seen,
             perception_s=seen - began,
             converged=update.reason is not Convergence.SEARCH_CUT_OFF,
@@ -160,11 +161,11 @@ class Estimator:
             PerceptionError: no frame has shown the sheet.
             MeshError: the sheet at rest is folded, or not one sheet.
         """
-        if self._sheet is None:
+        if self._tracked_or_none is None:
             if not self._perception.ready:
                 raise PerceptionError("no frame has shown the sheet yet; wait for one before planning a grasp.")
             with jax.enable_x64(True), one_thread():
-                self._sheet = TrackedSheet.build(self._perception.sheet(), self.declaration, self.config)
+                self._tracked_or_none = TrackedSheet.build(self._perception.sheet(), self.declaration, self.config)
         return self.sheet
 
     def release(self) -> None:
@@ -185,12 +186,13 @@ class Estimator:
             on_pass: called with each ratio's factor after each pass, for progress.
 
         Raises:
-            ValueError: asked before the first frame with closed jaws, or of another filter than 'implicit'.
+            ValueError: asked before `begin` and before the first frame with closed jaws, or of another filter than
+                'implicit'.
         """
-        filter = self._begun.filter.by_forces("can identify the sheet")
+        filter = self._tracked.filter.by_forces("can identify the sheet")
         self.release()
         with jax.enable_x64(True), one_thread():
-            found = identify(filter, self._begun.state, on_pass=on_pass)
+            found = identify(filter, self._tracked.state, on_pass=on_pass)
             self._take(found.state, found.summary)
         return material(self.declaration, found.factors, found.log_sd, converged=found.converged)
 
@@ -199,36 +201,36 @@ class Estimator:
         """The belief so far; call `release` first once a grasp is over.
 
         Raises:
-            ValueError: asked before the first frame with closed jaws.
+            ValueError: asked before `begin` and before the first frame with closed jaws.
         """
         with jax.enable_x64(True), one_thread():
-            return summaries.belief(self._begun.state.summary)
+            return summaries.belief(self._tracked.state.summary)
 
     @property
     def detection(self) -> Detection:
         """Which particles are called attached so far; see `belief`.
 
         Raises:
-            ValueError: asked before the first frame with closed jaws.
+            ValueError: asked before `begin` and before the first frame with closed jaws.
         """
-        sheet = self._begun
+        tracked = self._tracked
         return summaries.detection(
-            sheet.state.summary,
+            tracked.state.summary,
             self.declaration,
             self.config,
-            noise=sheet.filter.noise(sheet.state),
-            refined=Convergence(int(sheet.state.release_convergence)),
+            noise=tracked.filter.noise(tracked.state),
+            refined=Convergence(int(tracked.state.release_convergence)),
         )
 
     @property
     def prior_entropy(self) -> float:
         """Entropy of the belief before the first frame [nat]."""
-        return self._begun.prior_entropy
+        return self._tracked.prior_entropy
 
     @property
     def changes(self) -> list[Change]:
         """Cuts and sutures so far as the belief took them; of the filter 'implicit' alone."""
-        return [] if self._sheet is None else list(self._sheet.state.changes)
+        return [] if self._tracked_or_none is None else list(self._tracked_or_none.state.changes)
 
     def change_log_bayes_factor(self, change: Change) -> float | None:
         """Return the log Bayes factor of 'the change worked' against 'nothing changed' [nat].
@@ -238,10 +240,10 @@ class Estimator:
         Raises:
             ValueError: asked before `begin`, or of another filter than 'implicit'.
         """
-        sheet = self._begun
-        filter = sheet.filter.by_forces("can infer whether a cut or suture worked")
+        tracked = self._tracked
+        filter = tracked.filter.by_forces("can infer whether a cut or suture worked")
         with jax.enable_x64(True), one_thread():
-            return filter.log_bayes_factor(sheet.state, change)
+            return filter.log_bayes_factor(tracked.state, change)
 
     @property
     def balance(self) -> ForceBalance:
@@ -250,9 +252,9 @@ class Estimator:
         Raises:
             ValueError: asked before `begin`, or of another filter than 'implicit'.
         """
-        sheet = self._begun
+        tracked = self._tracked
         with jax.enable_x64(True):
-            return sheet.filter.by_forces("predicts pulls").balance(sheet.state)
+            return tracked.filter.by_forces("predicts pulls").balance(tracked.state)
 
     @property
     def attachment_belief(self) -> AttachmentBelief:
@@ -261,7 +263,7 @@ class Estimator:
         Raises:
             ValueError: asked before `begin`, or of another filter than 'implicit'.
         """
-        return self._begun.filter.by_forces("predicts pulls").belief(self._begun.state)
+        return self._tracked.filter.by_forces("predicts pulls").belief(self._tracked.state)
 
     @property
     def point_precision(self) -> Float[np.ndarray, "3 3"]:
@@ -270,7 +272,7 @@ class Estimator:
         Raises:
             ValueError: asked before `begin`.
         """
-        noise = self._begun.filter.noise(self._begun.state)
+        noise = self._tracked.filter.noise(self._tracked.state)
         return self._seen_precision / (1.0 if noise is None else noise.position)
 
     @property
@@ -278,21 +280,21 @@ class Estimator:
         """The particles; fixed from the first grasp on.
 
         Raises:
-            ValueError: asked before the first frame with closed jaws.
+            ValueError: asked before `begin` and before the first frame with closed jaws.
         """
-        _ = self._begun
+        _ = self._tracked
         return self._perception.sheet()
 
     @property
     def positions(self) -> Float[np.ndarray, "n 3"]:
         """Positions of the particles [m]: as estimated while the jaws hold some, else as last seen, or at rest."""
-        sheet = self._begun
+        tracked = self._tracked
         if self._grip.hold is not None:
-            return sheet.x
+            return tracked.x
         if self._open_frame is not None:
             with jax.enable_x64(True), one_thread():
-                sheet.open_x, self._open_frame = self._positions_with_open_jaws(self._open_frame), None
-        return sheet.open_x
+                tracked.open_x, self._open_frame = self._positions_with_open_jaws(self._open_frame), None
+        return tracked.open_x
 
     @property
     def rest_time(self) -> int:
@@ -321,13 +323,15 @@ class Estimator:
 
     def force_unknown(self, held: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return the particles that a grip on the held ones may pull at, the held ones included."""
-        return self._begun.field.dilated(held)
+        return self._tracked.field.dilated(held)
 
     @property
-    def _begun(self) -> TrackedSheet:
-        if self._sheet is None:
-            raise ValueError("the sheet is not known before the first frame with closed jaws; call update first.")
-        return self._sheet
+    def _tracked(self) -> TrackedSheet:
+        if self._tracked_or_none is None:
+            raise ValueError(
+                "the sheet is not known before the first frame with closed jaws; call update with it, or begin."
+            )
+        return self._tracked_or_none
 
     def _change(self, event: Cut | Suture, index: int) -> None:
         """Take a cut or suture into the belief, before the observation that it was seen with."""
@@ -336,19 +340,19 @@ class Estimator:
             self.skipped.append((index, f"the {type(event).__name__.lower()} is beside the sheet, and was left out"))
             return
         self._release()
-        sheet = self._begun
-        sheet.state = sheet.filter.change(sheet.state, event, region=region, index=index)
+        tracked = self._tracked
+        tracked.state = tracked.filter.change(tracked.state, event, region=region, index=index)
 
     def _release(self, *, at_the_end: bool = False) -> None:
-        if (sheet := self._sheet) is None:
+        if (tracked := self._tracked_or_none) is None:
             return
         thorough = at_the_end or self.config.refinement == "grasps"
         with jax.enable_x64(True), one_thread():
-            self._take(*sheet.filter.release(sheet.state, thorough=thorough))
+            self._take(*tracked.filter.release(tracked.state, thorough=thorough))
 
     def _take(self, state: FilterState, summary: PosteriorSummary | None) -> None:
         """Take the state after a refinement, and refuse a posterior that is not finite."""
-        self._begun.state = state
+        self._tracked.state = state
         if summary is not None and not summary.is_finite:
             raise PerceptionError(
                 "refined together, the frames of all grasps leave no finite belief: no attachments explain them "
@@ -357,21 +361,21 @@ class Estimator:
 
     def _see(self, observation: Observation) -> Track:
         return self._perception.track(
-            observation, predicted=self._begun.x, simulator_input=lambda: self._prediction(observation.tool)
+            observation, predicted=self._tracked.x, simulator_input=lambda: self._prediction(observation.tool)
         )
 
     def _prediction(self, tool: ToolState) -> SimulatorInput:
         """Return the state before a frame, b, and the moved grip, for a cloud without identities."""
-        sheet = self._begun
-        hold, before = self._grasp(Track.of_nothing(len(sheet.x)), tool)
+        tracked = self._tracked
+        hold, before = self._grasp(Track.of_nothing(len(tracked.x)), tool)
         stiffness = jnp.where(hold.held, self.config.grip_stiffness * self.declaration.membrane_stiffness, 0.0)
         moved = pull(before, tool, hold)
-        return before, np.asarray(sheet.state.summary.b), Grip.of(moved.tip, moved.length, stiffness)
+        return before, np.asarray(tracked.state.summary.b), Grip.of(moved.tip, moved.length, stiffness)
 
     def _grasp(self, track: Track, tool: ToolState) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
         """Return the grasp of a frame, and the state to start from; see `GripTracker.grasp`."""
         return self._grip.grasp(
-            tool, state=self._begun.x, rest=self.sheet.rest, track=track, named=self._named_held(tool)
+            tool, state=self._tracked.x, rest=self.sheet.rest, track=track, named=self._named_held(tool)
         )
 
     def _named_held(self, tool: ToolState) -> Bool[np.ndarray, " n"] | None:
@@ -389,4 +393,4 @@ class Estimator:
             track = self._see(observation) if self._perception.identifies else None
         except PerceptionError:
             return rest
-        return rest if track is None else fill_unseen(track, rest, self._begun.field)
+        return rest if track is None else fill_unseen(track, rest, self._tracked.field)

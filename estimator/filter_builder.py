@@ -4,7 +4,7 @@ from typing import Any
 
 from jiggle_mj.observation import Declaration
 
-from .belief.boundary_belief import BoundaryBelief
+from .belief.gaussian_belief import GaussianBelief
 from .belief.prior import prior_belief
 from .config import EstimatorConfig
 from .filters.adam import RATE, AdamShooting
@@ -38,11 +38,11 @@ def build_filter(mesh: SheetMesh, declaration: Declaration, config: EstimatorCon
     energy = surrogate(mesh, declaration, membrane=config.membrane)
     if config.filter == "implicit":
         balance = force_balance(mesh, energy, declaration, config)
-        prior = prior_belief(mesh, reference=float(balance.reference), config=config.prior)
+        prior = prior_belief(mesh, reference=float(balance.reference), config=config.prior, belief=config.belief)
         return ImplicitFilter(declared_balance=balance, prior=prior, sampling=config.sampling)
     prior_sd, grip_stiffness = config.prior_sd * k, config.grip_stiffness * k
     mean = PRIOR_MEAN if config.filter == "explicit" else 0.0
-    prior = BoundaryBelief.prior(mesh.n, mean=mean, sd=prior_sd)
+    prior = GaussianBelief.prior(mesh.n, mean=mean, sd=prior_sd)
     if config.filter == "explicit":
         return MultipleShooting(
             prior=prior,

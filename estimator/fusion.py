@@ -25,6 +25,8 @@ class FusedFrame:
     """Positions and their precision by perception and grip together."""
     start: Float[np.ndarray, "n 3"]
     """Positions from which a search of the state begins, smooth where nothing was seen [m]."""
+    slip: float
+    """Median distance of the held particles from where the tool should have taken them [m]; 0 if none was seen."""
 
 
 def fuse(
@@ -47,6 +49,7 @@ def fuse(
         field: fills what is unknown from its surroundings.
     """
     seen, held, expected = track.visible, hold.held, hold.expected(tool)
+    distance = np.linalg.norm((track.positions - expected)[seen & held], axis=1)
     weighted = np.einsum("nij,nj->ni", track.precision, np.nan_to_num(track.positions))
     grip = np.where(held, grip_sd**-2, 0.0)
     precision = track.precision + grip[:, None, None] * np.eye(3)
@@ -66,7 +69,7 @@ def fuse(
         force_unknown=jnp.asarray(field.dilated(held)),
         pull=pull(before, tool, hold),
     )
-    return FusedFrame(evidence=evidence, start=start)
+    return FusedFrame(evidence=evidence, start=start, slip=float(np.median(distance)) if len(distance) else 0.0)
 
 
 def pull(before: Float[np.ndarray, "n 3"], tool: ToolState, hold: GripHold) -> Pull:

@@ -60,11 +60,6 @@ class GripHold:
         """Return where the held particles are if they move and rotate with the tool [m]; meaningless for others."""
         return self.rotated(tool) + (tool.position - self.tip)
 
-    def slip(self, track: Track, tool: ToolState) -> float:
-        """Return the median distance of the held particles from where the tool should have taken them [m]; 0 unseen."""
-        distance = np.linalg.norm((track.positions - self.expected(tool))[track.visible & self.held], axis=1)
-        return float(np.median(distance)) if len(distance) else 0.0
-
 
 @dataclass(kw_only=True)
 class GripTracker:

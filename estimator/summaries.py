@@ -5,7 +5,7 @@ import numpy as np
 from jiggle_mj.estimate import Belief, Detection
 from jiggle_mj.observation import Declaration
 
-from .belief.boundary_belief import BoundaryBelief
+from .belief.gaussian_belief import GaussianBelief
 from .config import EstimatorConfig
 from .filters.noise import Noise
 from .filters.posterior_summary import Convergence, PosteriorSummary
@@ -17,7 +17,7 @@ RULE = "P(attached) > 0.5"
 def belief(summary: PosteriorSummary) -> Belief:
     """Return mean and covariance, and the 90 % intervals of a belief over bounded stiffnesses."""
     mean, covariance = summary.belief.moments()
-    if isinstance(summary.belief, BoundaryBelief):
+    if isinstance(summary.belief, GaussianBelief):
         return Belief(mean=np.asarray(mean), covariance=np.asarray(covariance))
     lower, upper = summary.belief.interval()
     return Belief(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from jiggle_mj.estimator import Estimator as Estimator
     from jiggle_mj.estimator import EstimatorConfig as EstimatorConfig
-    from jiggle_mj.eval.metrics.score import score as score
+    from jiggle_mj.eval.metrics.result import score as score
     from jiggle_mj.eval.runs.closing_the_loop import close_loop as close_loop
     from jiggle_mj.eval.runs.experiment import run_estimator as run_estimator
     from jiggle_mj.eval.runs.experiment import run_scene as run_scene
@@ -133,7 +133,7 @@ _NAMES_OF_MODULE = {
     "estimator": ("Estimator", "EstimatorConfig"),
     "eval.runs.closing_the_loop": ("close_loop",),
     "eval.runs.experiment": ("run_estimator", "run_scene"),
-    "eval.metrics.score": ("score",),
+    "eval.metrics.result": ("score",),
     "importing.folder": ("import_folder",),
     "material": ("Material",),
     "observation": ("Declaration", "DeclaredMesh", "MeasuredPoints", "Observation", "StereoPair", "ToolState"),

@@ -62,7 +62,7 @@ class Reference:
             raise ValueError(f"sensing = {sensing!r}: must be one of {', '.join(map(repr, SENSING))}.")
         if seed < 0:
             raise SceneError(f"seed = {seed}: must be an integer of at least 0.")
-        self.scene, self.sensing, self.seed = scene, sensing, seed
+        self.scene, self.sensing = scene, sensing
         self.simulation = Simulation(scene, drawn=sensing == "stereo", dump_dir=dump_dir)
         """Truth: MuJoCo's state behind the experiment, for tests of the reference. An estimator must not read it."""
         noise = np.random.default_rng([scene.seed, seed])

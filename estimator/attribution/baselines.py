@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .closed_frames import ClosedFrame, Timed
+from .grasped_frames import ClosedFrame, Timed
 from .held_out import rms
 
 

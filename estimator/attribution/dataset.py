@@ -15,7 +15,7 @@ from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, Tool
 
 from ..config import EstimatorConfig
 from ..estimator import Estimator
-from .closed_frames import ClosedFrame, Timed
+from .grasped_frames import ClosedFrame, Timed
 from .held_shape import another_shape
 from .still_noise import StillNoise, measure
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from .baselines import in_proportion, unmoved
-from .closing import Closed
+from .close_loop import Closed
 from .dataset import Dataset
 from .held_out import HeldOut
 from .hypotheses import Hypothesis, reported_sd

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from ..effects.sheet_model import FrameContext
 from ..parallel_map import T, parallel_map
-from .closed_frames import ClosedFrame
+from .grasped_frames import ClosedFrame
 from .linear import N_FIELDS, Metric, NormalEquations, WeightedResiduals, misfit, normal_equations, weigh
 from .normal_equations import less_offset
 from .problem import Point, Problem

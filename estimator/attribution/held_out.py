@@ -11,9 +11,9 @@ from scipy.stats import norm
 
 from ..belief.gaussian_information import GaussianInformation
 from ..parallel_map import parallel_map
-from .closed_frames import ClosedFrame
 from .every_frame import weighed
 from .fit import Fitted
+from .grasped_frames import ClosedFrame
 from .linear import Metric
 from .problem import Point, Problem
 from .sheet import predict_all

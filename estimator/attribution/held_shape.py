@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from .closed_frames import Timed
+from .grasped_frames import Timed
 
 MIN_HELD = 4
 """Smallest number of held particles whose shape is compared."""

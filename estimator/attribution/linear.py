@@ -25,7 +25,7 @@ from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
 from ..filters.frame import Frame
 from ..physics.membrane import TriangleMembrane
-from .closed_frames import ClosedFrame
+from .grasped_frames import ClosedFrame
 from .sheet import PredictedSheet, look, mean_of_held, tool_residual
 
 WAVES = 4

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..belief.gaussian_information import GaussianInformation
-from .closed_frames import ClosedFrame
+from .grasped_frames import ClosedFrame
 from .linear import N_FIELDS, NormalEquations, grasp_sd, tool_sd
 from .problem import Problem
 

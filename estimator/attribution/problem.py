@@ -13,8 +13,8 @@ from ..effects.effect import Effect
 from ..effects.sheet_model import centred, nominal_energy
 from ..filter_builder import force_balance
 from ..physics.mesh import SheetMesh
-from .closed_frames import FrameHistory
 from .dataset import Dataset
+from .grasped_frames import FrameHistory
 from .sheet import PredictedSheet
 
 NUISANCE = {
@@ -60,15 +60,15 @@ class Problem:
         """Return the problem for a recording and the effects that the model may lack."""
         estimator = dataset.estimator
         mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
-        energy = nominal_energy(mesh, estimator.declaration)
-        balance = force_balance(mesh, energy, estimator.declaration, estimator.config).inflated(FORCE_VARIANCE)
+        energy, config = nominal_energy(mesh, estimator.declaration), estimator.config
+        balance = force_balance(mesh, energy, estimator.declaration, config).inflated(FORCE_VARIANCE)
         library = tuple(effect for effect in library if estimator.declaration.hangs or not effect.hanging)
         sheet = PredictedSheet(balance=balance, view=centred(mesh), library=library)
         own = {name: sd for name, sd in NUISANCE.items() if any(effect.name == name for effect in library)}
         return cls(
             sheet=sheet,
             history=FrameHistory(dataset.frames, mesh.rest),
-            prior=prior_belief(mesh, reference=float(balance.reference)),
+            prior=prior_belief(mesh, reference=float(balance.reference), config=config.prior, belief=config.belief),
             noise=dataset.fields,
             prior_sd=np.concatenate([np.tile(effect.prior_sd, effect.sites) for effect in library]),
             own=np.concatenate([[], *(sheet.place(name) for name in own)]).astype(int),

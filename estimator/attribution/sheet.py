@@ -12,7 +12,7 @@ from ..filters.force_balance import ForceBalance
 from ..parallel_map import parallel_map
 from ..physics.energy import SheetEnergy
 from ..physics.membrane import TriangleMembrane
-from .closed_frames import ClosedFrame, FrameHistory
+from .grasped_frames import ClosedFrame, FrameHistory
 
 GRIP_PRECISION = 1e6
 """Precision of the held particles' positions while a state is predicted [1/m^2]."""

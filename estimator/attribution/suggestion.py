@@ -17,11 +17,11 @@ from jaxtyping import Array, Float
 
 from ..physics.mesh import farthest_points
 from ..planning.information_config import SLANTED, UP, InformationPolicyConfig
-from .closed_frames import USUAL_GAP, ClosedFrame, FrameHistory, Timed
-from .closing import Closed
+from .close_loop import Closed
 from .dataset import Dataset
 from .every_frame import cost_under, weighed
 from .fit import Fitted
+from .grasped_frames import USUAL_GAP, ClosedFrame, FrameHistory, Timed
 from .held_out import from_rest
 from .problem import Point, Problem
 from .sheet import look

@@ -32,7 +32,7 @@ from .expectation_propagation import (
     sites_with_variance,
 )
 from .gaussian_information import Gaussian, GaussianInformation
-from .posterior import MAX_MEAN, Posterior
+from .marginals import MAX_MEAN, Posterior
 from .spike_and_slab import Mixture
 
 PRIOR_SWEEPS = 20
@@ -44,6 +44,7 @@ class AttachmentBelief(eqx.Module):
     """Belief over s: Gaussian evidence, the prior, and the sites and messages that stand for the prior."""
 
     prior: AttachmentPrior
+    """Which particles are attached, and how stiffly, before any evidence."""
     reference: Float[Array, ""]
     """Stiffness b_ref at which s is 1/2 [N/m]."""
     precision: Float[Array, "n n"]
@@ -57,6 +58,7 @@ class AttachmentBelief(eqx.Module):
     message: Float[Array, "n d"]
     """Log odds of being attached that each neighbour adds."""
     config: BeliefConfig = eqx.field(static=True, default_factory=BeliefConfig)
+    """Settings of the sweeps, the samples and the intervals."""
 
     @classmethod
     def before(
@@ -109,7 +111,7 @@ class AttachmentBelief(eqx.Module):
         return self.information.gaussian()
 
     def changed(self, region: Bool[Array, " n"], probability: Float[Array, " n"]) -> "AttachmentBelief":
-        """Forget what was known of the attachments of a region, after a cut or a suture.
+        """Return the belief after a cut or suture, with what was known of a region's attachments forgotten.
 
         The old s of the region is integrated out, so that the evidence about all other particles stays. See
         `AttachmentPrior.isolated` for the messages of neighbours.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from ..physics.mesh import SheetMesh
 from .attachment_belief import AttachmentBelief
 from .attachment_prior import AttachmentPrior
+from .config import BeliefConfig
 from .spike_and_slab import SpikeAndSlab
 
 
@@ -55,13 +56,16 @@ def stiffness_prior(config: PriorConfig) -> SpikeAndSlab:
     )
 
 
-def prior_belief(mesh: SheetMesh, *, reference: float, config: PriorConfig | None = None) -> AttachmentBelief:
+def prior_belief(
+    mesh: SheetMesh, *, reference: float, config: PriorConfig | None = None, belief: BeliefConfig | None = None
+) -> AttachmentBelief:
     """Return the belief over a sheet's attachments before anything is seen.
 
     Args:
         mesh: the sheet.
         reference: b_ref, the stiffness of s = 1/2 [N/m].
         config: numbers of the prior; the defaults if None.
+        belief: numbers of the belief; the defaults if None.
     """
     config = config or PriorConfig()
     prior = AttachmentPrior.build(
@@ -71,4 +75,4 @@ def prior_belief(mesh: SheetMesh, *, reference: float, config: PriorConfig | Non
         probability=config.probability,
         coupling=config.coupling,
     )
-    return AttachmentBelief.before(prior, reference=reference)
+    return AttachmentBelief.before(prior, reference=reference, config=belief)

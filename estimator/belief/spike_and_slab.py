@@ -108,6 +108,16 @@ class SpikeAndSlab(eqx.Module):
         )
 
     @property
+    def spike(self) -> Float[Array, ""]:
+        """Return the width of s where a particle is free."""
+        return self.sd[0]
+
+    @property
+    def spread(self) -> Float[Array, ""]:
+        """Return the relative width of each component."""
+        return self.sd[1] / self.mean[1]
+
+    @property
     def share(self) -> Float[Array, " _components"]:
         """Return the probability of each component of an attached particle."""
         return self.border_kernel @ self.weights

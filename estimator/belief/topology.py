@@ -17,7 +17,6 @@ from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.regions import distance_to_path
 
 from .attachment_belief import AttachmentBelief
-from .prior import PriorConfig
 
 FAILURE_PROBABILITY = 0.1
 """Probability that a cut or suture had no effect, before any frame shows it."""
@@ -97,6 +96,6 @@ def _log_bayes_factor(
     shift: Float[Array, " n"],
 ) -> Float[Array, ""]:
     intended = before.bounded(jnp.full(len(region), stiffness))
-    prior = PriorConfig()
+    prior = before.prior.stiffness
     success = before.fixed(region, intended, jnp.maximum(prior.spread * intended, prior.spike))
     return success.evidence_for(precision, shift) - before.evidence_for(precision, shift)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jiggle_mj.options import FilterName
 
-from ..belief.boundary_belief import BoundaryBelief
+from ..belief.gaussian_belief import GaussianBelief
 from ..physics.simulator import SWEEPS_PER_STEP
 from ..physics.xpbd import XPBD
 from .evidence import Evidence
@@ -76,7 +76,7 @@ class AdamShooting(GaussianFilter[AdamState]):
         b, moments = descend(self.simulator, state.summary.b, state.moments, shots, rate=self.rate)
         none = unavailable(b)
         outcome = Update(
-            belief=BoundaryBelief(precision=jnp.broadcast_to(none, (len(b), len(b))), shift=none),
+            belief=GaussianBelief(precision=jnp.broadcast_to(none, (len(b), len(b))), shift=none),
             x=evidence.y,
             b=b,
             sd=none,

@@ -15,7 +15,7 @@ Differences from the paper, and choices where it gives nothing:
 - f and J are taken at the non-negative mean, since f has no meaning at b < 0. The innovation counts from there:
   x_pred = f(b) + J (mean - b). To compare f(b) with what belongs to the mean would let b < 0 diverge.
 - As in the paper, whose simulated x_m has no noise, noise in x_m is ignored.
-- The paper gives neither bending stiffness nor time step nor sweeps (see `shots`), nor Sigma_0.
+- The paper gives neither bending stiffness nor time step nor sweeps (see `physics.simulator`), nor Sigma_0.
 """
 
 from dataclasses import replace
@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jiggle_mj.options import FilterName
 
-from ..belief.boundary_belief import BoundaryBelief
+from ..belief.gaussian_belief import GaussianBelief
 from ..belief.gaussian_information import Gaussian
 from ..physics.simulator import SWEEPS_PER_STEP
 from ..physics.xpbd import XPBD
@@ -81,7 +81,7 @@ class MultipleShooting(GaussianFilter[ShootingState]):
     ) -> tuple[ShootingState, Update]:
         """See `Filter.update`; one frame and k - 1 earlier ones enter the belief, and start is not used."""
         before = state.summary.belief
-        assert isinstance(before, BoundaryBelief)
+        assert isinstance(before, GaussianBelief)
         history, shots = state.history.with_step(evidence, grip_stiffness=self.grip_stiffness).draw(self.samples)
         belief, gaussian, nis = update(self.simulator, before, state.summary.b, shots, sweeps=SWEEPS_PER_STEP)
         b = non_negative(belief, state.summary.b)
@@ -105,8 +105,8 @@ class MultipleShooting(GaussianFilter[ShootingState]):
 
 @eqx.filter_jit
 def update(
-    simulator: XPBD, belief: BoundaryBelief, b: Float[Array, " n"], shots: Shots, *, sweeps: int
-) -> tuple[BoundaryBelief, Gaussian, Float[Array, ""]]:
+    simulator: XPBD, belief: GaussianBelief, b: Float[Array, " n"], shots: Shots, *, sweeps: int
+) -> tuple[GaussianBelief, Gaussian, Float[Array, ""]]:
     """Return the belief after all samples together, the same with its precision factorised, and the NIS.
 
     The NIS is the squared innovation per degree of freedom.
@@ -139,6 +139,6 @@ def update(
 
 
 @eqx.filter_jit
-def non_negative(belief: BoundaryBelief, b: Float[Array, " n"]) -> Float[Array, " n"]:
+def non_negative(belief: GaussianBelief, b: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return the mean under b >= 0 [N/m], searched from b."""
     return belief.non_negative_mean(b > 0)

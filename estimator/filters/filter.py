@@ -14,7 +14,7 @@ from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.options import FilterName
 
 from ..belief.attachment_belief import AttachmentBelief
-from ..belief.boundary_belief import BoundaryBelief
+from ..belief.gaussian_belief import GaussianBelief
 from ..belief.topology import Change, meant_by
 from ..physics.energy import SheetEnergy
 from .evidence import Evidence
@@ -150,7 +150,7 @@ class ForceBalanceFilter(Filter[State]):
 class GaussianFilter(Filter[State]):
     """A filter with a Gaussian belief over the stiffnesses themselves."""
 
-    prior: BoundaryBelief
+    prior: GaussianBelief
     """Belief before the first frame."""
     prior_sd: float
     """Standard deviation of each stiffness before the first frame [N/m]; also the least after a cut or suture."""
@@ -166,7 +166,7 @@ class GaussianFilter(Filter[State]):
         is larger.
         """
         belief = state.summary.belief
-        assert isinstance(belief, BoundaryBelief)
+        assert isinstance(belief, GaussianBelief)
         intended = meant_by(event)
         shift = jnp.where(region, intended - belief.mean(), 0.0)
         sd = max(self.prior_sd, intended)

@@ -183,12 +183,27 @@ class ForceBalance(eqx.Module):
             return frame, following, jnp.nanmin(costs) < (1 - config.min_cost_decrease) * costs[0], count + 1
 
         def unfinished(state):
-            return state[2] & (state[3] < config.max_state_steps)
+            _, _, decreasing, count = state
+            return decreasing & (count < config.max_state_steps)
 
+        # a frame of the right shapes, which the first step replaces
         shapes = jax.eval_shape(lambda: self.linearise(x, s, evidence))
         empty = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
-        frame, _, gaining, _ = jax.lax.while_loop(unfinished, step, (empty, x, jnp.asarray(True), jnp.asarray(0)))
-        return eqx.tree_at(lambda frame: frame.converged, frame, ~gaining)
+        frame, _, decreasing, _ = jax.lax.while_loop(unfinished, step, (empty, x, jnp.asarray(True), jnp.asarray(0)))
+        return eqx.tree_at(lambda frame: frame.converged, frame, ~decreasing)
+
+    def evidence_near(
+        self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
+    ) -> tuple[Frame, Fit, FrameInformation]:
+        """Return a frame linearised at a state near x [m], its fit, and its evidence about s, as one program."""
+        return _evidence_near(self, x, s, evidence)
+
+    def settled_evidence(
+        self, start: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
+    ) -> tuple[Frame, FrameInformation]:
+        """Return a frame linearised near where the sheet settles from `start` [m], and its evidence about s."""
+        frame, _, information = self.evidence_near(_settle(self, start, s, evidence), s, evidence)
+        return frame, information
 
     def polish(self, frame: Frame, s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
         """Return the state for another s [m], by one step with the frame's own factor."""
@@ -202,9 +217,9 @@ class ForceBalance(eqx.Module):
         identity = jnp.where(identity, jnp.eye(3, dtype=x.dtype), 0.0)
         dr_dx = (1 - s)[:, None, None, None] * internal + (s * self.reference)[:, None, None, None] * identity
         squares = jnp.einsum("n,npij,nqik->npjqk", weight, dr_dx, dr_dx)
-        matrix = assemble(self.layout, [(self.places, squares)])
+        A = assemble(self.layout, [(self.places, squares)])
         floor = self.config.position_precision_floor
-        matrix = add_to_diagonal(self.layout, matrix, evidence.precision + floor * jnp.eye(3)[None])
+        A = add_to_diagonal(self.layout, A, evidence.precision + floor * jnp.eye(3)[None])
         return Frame(
             x=x,
             s=s,
@@ -214,7 +229,7 @@ class ForceBalance(eqx.Module):
             dr_dx=dr_dx,
             error=error,
             weight=weight,
-            factor=cholesky(matrix),
+            factor=cholesky(A),
             converged=jnp.asarray(True),
             innovation=jnp.where(evidence.seen[:, None], evidence.y - x, 0.0),
         )
@@ -239,7 +254,10 @@ class ForceBalance(eqx.Module):
         return FrameInformation(precision=self.precision_along(frame, D), score=score, chi2=chi2, at=frame.s)
 
     def precision_along(self, frame: Frame, D: Float[Array, "n 3"]) -> Float[Array, "n n"]:
-        """Return D^T N^-1 D for a matrix D with a column for each particle, which is `D[i]` there and 0 elsewhere."""
+        """Return D^T N^-1 D for a matrix D with a column for each particle, which is `D[i]` there and 0 elsewhere.
+
+        By A = R^-1 + H^T W H = L L^T it is diag(w |D|^2) - |L^-1 H^T W D|^2.
+        """
         layout, w = self.layout, frame.weight
         spread = jnp.einsum("npij,n,ni->npj", frame.dr_dx, w, D)
         padded = layout.n_blocks * layout.width
@@ -326,10 +344,26 @@ class ForceBalance(eqx.Module):
         return jnp.einsum("npij,npj->ni", rows, padded[self.neighbours])
 
     def _state_step(self, frame: Frame, s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
-        """Return a step of the frame's state at fixed s, with its factor: a Gauss-Newton step if s is the frame's."""
+        """Return the step A^-1 (R^-1 (y - x) - H^T W r) at fixed s; a Gauss-Newton step if s is the frame's, as A is.
+
+        With D = b_ref d - f it is r = b_ref d - (1 - s) D and H = b_ref I - (1 - s) dD/dx.
+        """
         pull = jnp.einsum("nij,nj->ni", evidence.precision, evidence.y - frame.x)
         d, free = frame.x - self.energy.rest, (1 - s)[:, None]
         unbalanced = self.reference * d - free * frame.dr_ds
         weighted = self._weight(frame.error, s, evidence)[:, None] * unbalanced
         push = self.reference * weighted - self._transposed(frame.dD_dx, free * weighted)
         return solve(self.layout, frame.factor, pull - push)
+
+
+_settle = eqx.filter_jit(ForceBalance.settle)
+
+
+@eqx.filter_jit
+def _evidence_near(
+    balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
+) -> tuple[Frame, Fit, FrameInformation]:
+    """Return a frame linearised at a state near x, its fit, and its evidence about s."""
+    frame = balance.approach(x, s, evidence)
+    fit = balance.fit(frame)
+    return frame, fit, balance.information(frame, fit)

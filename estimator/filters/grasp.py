@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from ..parallel_map import parallel_map
 from .evidence import Evidence
 from .force_balance import ForceBalance
-from .frame import Fit, Frame, FrameInformation
+from .frame import FrameInformation
 from .noise import ForceResiduals, Noise
 
 
@@ -69,22 +69,12 @@ class GraspFrames(eqx.Module):
 
         def relinearise(k: int) -> tuple[Float[Array, "n 3"], FrameInformation, ForceResiduals]:
             evidence = self.frames[k].evidence.inflated(noise.position)
-            frame, fit, information = linearise(balance, self.frames[k].x, s, evidence)
+            frame, fit, information = balance.evidence_near(self.frames[k].x, s, evidence)
             return frame.x, information, _residuals(balance, frame, fit, evidence)
 
         for k, (x, information, residuals) in parallel_map(relinearise, range(len(self.frames))).items():
             grasp = grasp.with_frame(self.frames[k].evidence, x, information, residuals)
         return grasp
-
-
-@eqx.filter_jit
-def linearise(
-    balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
-) -> tuple[Frame, Fit, FrameInformation]:
-    """Return a frame linearised at a state near x, its fit, and its evidence about s."""
-    frame = balance.approach(x, s, evidence)
-    fit = balance.fit(frame)
-    return frame, fit, balance.information(frame, fit)
 
 
 _residuals = eqx.filter_jit(ForceBalance.residuals)

@@ -27,7 +27,7 @@ from .evidence import Evidence
 from .filter import FilterState, ForceBalanceFilter, Region
 from .force_balance import ForceBalance
 from .frame import Frame, FrameInformation
-from .grasp import GraspFrames, linearise
+from .grasp import GraspFrames
 from .noise import Noise
 from .posterior_summary import Convergence, PosteriorSummary, Update, prior_summary
 
@@ -119,7 +119,7 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
         """See `Filter.update`: settle the sheet near what was seen, linearise there, add the evidence, sweep once."""
         s, balance = state.belief.bounded(state.summary.b), self.balance(state)
         inflated = evidence.inflated(state.noise.position)
-        frame, _, information = linearise(balance, _settled(balance, start, s, inflated), s, inflated)
+        frame, information = balance.settled_evidence(start, s, inflated)
         update = _updated(balance, state.belief, frame, information, inflated)
         if not update.explains_the_frame:
             return state, update
@@ -264,9 +264,6 @@ def quick_summary(belief: AttachmentBelief, *, seed: int = 0, config: SamplingCo
 def likeliest(belief: AttachmentBelief, *, seed: int = 0) -> Float[Array, " n"]:
     """Return the s of the attachments that are likeliest together."""
     return belief.mode(jax.random.key(seed))
-
-
-_settled = eqx.filter_jit(ForceBalance.settle)
 
 
 def _with_release(state: ImplicitState, summary: PosteriorSummary) -> tuple[ImplicitState, PosteriorSummary]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jiggle_mj.options import FilterName
 
-from ..belief.boundary_belief import BoundaryBelief
+from ..belief.gaussian_belief import GaussianBelief
 from ..physics.energy import SheetEnergy
 from .evidence import Evidence
 from .filter import FilterState, GaussianFilter
@@ -41,7 +41,7 @@ class NonNegativeLeastSquares(GaussianFilter[FilterState]):
 
     @classmethod
     def build(
-        cls, energy: SheetEnergy, *, prior: BoundaryBelief, prior_sd: float, force_sd: float
+        cls, energy: SheetEnergy, *, prior: GaussianBelief, prior_sd: float, force_sd: float
     ) -> "NonNegativeLeastSquares":
         """Prepare the regression for a sheet's energy without attachments.
 
@@ -73,7 +73,7 @@ class NonNegativeLeastSquares(GaussianFilter[FilterState]):
     def update(self, state: FilterState, evidence: Evidence, start: Float[Array, "n 3"]) -> tuple[FilterState, Update]:
         """See `Filter.update`; the search for the smooth state begins at `start`, with springs b."""
         belief = state.summary.belief
-        assert isinstance(belief, BoundaryBelief)
+        assert isinstance(belief, GaussianBelief)
         outcome = _updated(self.energy, self.tethered, self.force_sd, belief, state.summary.b, evidence, start)
         return (replace(state, summary=outcome) if outcome.explains_the_frame else state), outcome
 
@@ -83,7 +83,7 @@ def _updated(
     energy: SheetEnergy,
     tethered: Tethered,
     force_sd: Float[Array, ""],
-    belief: BoundaryBelief,
+    belief: GaussianBelief,
     b: Float[Array, " n"],
     evidence: Evidence,
     start: Float[Array, "n 3"],

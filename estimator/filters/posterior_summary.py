@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..belief.attachment_belief import AttachmentBelief
-from ..belief.boundary_belief import BoundaryBelief
+from ..belief.gaussian_belief import GaussianBelief
 
 
 class Convergence(IntEnum):
@@ -35,7 +35,7 @@ class Convergence(IntEnum):
 class PosteriorSummary(eqx.Module):
     """A filter's belief and each particle's own numbers; NaN where a filter gives no uncertainty or no P(attached)."""
 
-    belief: BoundaryBelief | AttachmentBelief
+    belief: GaussianBelief | AttachmentBelief
     """Posterior over all attachments, of the filter's own kind."""
     b: Float[Array, " n"]
     """Non-negative mean of each stiffness [N/m]."""
@@ -78,7 +78,7 @@ class Update(PosteriorSummary):
         return are_finite(self.x, self.b)
 
 
-def prior_summary(belief: BoundaryBelief | AttachmentBelief, n: int) -> PosteriorSummary:
+def prior_summary(belief: GaussianBelief | AttachmentBelief, n: int) -> PosteriorSummary:
     """Return the summary of a prior over n particles: b = 0, and no number for a single particle."""
     unknown = jnp.full(n, jnp.nan)
     return PosteriorSummary(

@@ -28,7 +28,7 @@ from scipy.cluster.vq import kmeans2
 
 from jiggle_mj.options import FilterName
 
-from ..belief.boundary_belief import BoundaryBelief, non_negative_minimum
+from ..belief.gaussian_belief import GaussianBelief, non_negative_minimum
 from ..physics.energy import SheetEnergy
 from ..physics.environment import Grip
 from ..physics.equilibrium import equilibrium
@@ -50,7 +50,7 @@ PATCH_SEED = 0
 class UnscentedState(FilterState):
     """The particles' marginals, and the belief over the patches."""
 
-    reduced: BoundaryBelief | None
+    reduced: GaussianBelief | None
     """Belief over the stiffness of each patch; None before the first frame."""
 
 
@@ -72,7 +72,7 @@ class ReducedUnscented(GaussianFilter[UnscentedState]):
         mesh: SheetMesh,
         energy: SheetEnergy,
         *,
-        prior: BoundaryBelief,
+        prior: GaussianBelief,
         prior_sd: float,
         grip_stiffness: float,
         force_tolerance: float,
@@ -129,7 +129,7 @@ class ReducedUnscented(GaussianFilter[UnscentedState]):
         mean, covariance = reduced.moments()
         theta = non_negative_minimum(reduced.precision, reduced.shift, mean > 0)
         variance = jnp.diagonal(covariance)
-        marginals = BoundaryBelief(precision=jnp.diag(1 / variance[patch]), shift=(mean / variance)[patch])
+        marginals = GaussianBelief(precision=jnp.diag(1 / variance[patch]), shift=(mean / variance)[patch])
         outcome = Update(
             belief=marginals,
             x=x,
@@ -144,28 +144,28 @@ class ReducedUnscented(GaussianFilter[UnscentedState]):
             return replace(state, reduced=before), outcome
         return replace(state, summary=outcome, reduced=reduced), outcome
 
-    def _reduced(self, state: UnscentedState) -> BoundaryBelief:
+    def _reduced(self, state: UnscentedState) -> GaussianBelief:
         """Return the belief over the patches; before the first frame, of the first particle of each."""
         if state.reduced is not None:
             return state.reduced
         belief = state.summary.belief
-        assert isinstance(belief, BoundaryBelief)
+        assert isinstance(belief, GaussianBelief)
         mean, covariance = belief.moments()
         first = jnp.asarray([np.flatnonzero(self.patch == k)[0] for k in range(int(self.patch.max()) + 1)])
         precision = jnp.diag(1 / jnp.diagonal(covariance)[first])
-        return BoundaryBelief(precision=precision, shift=precision @ mean[first])
+        return GaussianBelief(precision=precision, shift=precision @ mean[first])
 
 
 @eqx.filter_jit
 def update(
     gripped: SheetEnergy,
     patch: Int[Array, " n"],
-    state: BoundaryBelief,
+    state: GaussianBelief,
     evidence: Evidence,
     start: Float[Array, "n 3"],
     *,
     force_tolerance: Float[Array, ""],
-) -> tuple[BoundaryBelief, Float[Array, "n 3"], Float[Array, ""], Bool[Array, ""]]:
+) -> tuple[GaussianBelief, Float[Array, "n 3"], Float[Array, ""], Bool[Array, ""]]:
     """Return the reduced belief after one frame, the mean state [m], the NIS, and whether all equilibria were found.
 
     The NIS is the squared innovation per degree of freedom.

@@ -49,6 +49,19 @@ class MeshField:
         factor = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         return factor.solve(np.asarray(confidence, float)[:, None] * target)
 
+    def repaired(
+        self, values: Float[np.ndarray, "n k"], known: Bool[np.ndarray, " n"], *, max_stray: float
+    ) -> tuple[Float[np.ndarray, "n k"], Bool[np.ndarray, " n"]]:
+        """Return the values where they are known and agree with their neighbours, a smooth fill elsewhere, and where.
+
+        Args:
+            values: anything finite where unknown.
+            known: where they were measured.
+            max_stray: largest distance from the median of the known neighbours, in the unit of the values.
+        """
+        usable = known & (self.stray(values, known) < max_stray)
+        return np.where(usable[:, None], values, self.fill(values, usable)), usable
+
     def dilated(self, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return the chosen particles and those that share an edge with one."""
         return chosen | ((self._neighbours >= 0) & chosen[self._neighbours]).any(axis=1)

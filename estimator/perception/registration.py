@@ -175,8 +175,7 @@ def _regularised(
 ) -> Float[np.ndarray, "n k"]:
     """Return shifts as measured where windows match and neighbours agree, and a smooth fill elsewhere."""
     known = (step.agreement > config.min_agreement) & step.shift.any(axis=1)
-    known &= field.stray(shift, known) < config.max_step_stray
-    return np.where(known[:, None], shift, field.fill(shift, known))
+    return field.repaired(shift, known, max_stray=config.max_step_stray)[0]
 
 
 def _white_noise(quality: Match, window: float) -> Float[np.ndarray, "n 1 1"]:

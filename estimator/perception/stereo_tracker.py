@@ -203,9 +203,8 @@ class StereoTracker:
     ) -> Float[np.ndarray, "n 3"]:
         """Return particles moved by the flow between two images, smooth where the flow cannot be used [px]."""
         flow, usable = flow_at(uvd[:, :2], *dense_flow(grey, now, max_gap=self._config.max_flow_gap))
-        usable &= self._field.stray(flow, usable) < self._config.max_flow_stray
-        filled = self._field.fill(flow, usable)
-        return uvd + np.pad(np.where(usable[:, None], flow, filled), ((0, 0), (0, 1)))
+        motion, _ = self._field.repaired(flow, usable, max_stray=self._config.max_flow_stray)
+        return uvd + np.pad(motion, ((0, 0), (0, 1)))
 
     def _coarse_disparity(
         self,
@@ -220,10 +219,9 @@ class StereoTracker:
         x, y = pixels.astype(np.float32).T
         value = cv2.remap(dense, x[None], y[None], cv2.INTER_NEAREST, borderValue=np.nan)[0].astype(float)
         change = np.where(np.isfinite(value), value - before, 0)[:, None]
-        usable = np.isfinite(value)
-        usable &= self._field.stray(change, usable) < self._config.max_disparity_stray
-        filled = self._field.fill(change, usable)
-        return before + np.where(usable, change[:, 0], filled[:, 0]), usable
+        max_stray = self._config.max_disparity_stray
+        change, usable = self._field.repaired(change, np.isfinite(value), max_stray=max_stray)
+        return before + change[:, 0], usable
 
     def _accept(
         self,

@@ -71,10 +71,10 @@ class InformationPolicyConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for one in fields(self):
-            value = getattr(self, one.name)
+        for setting in fields(self):
+            value = getattr(self, setting.name)
             if np.any(np.less(value, 0)):
-                raise ValueError(f"InformationPolicyConfig.{one.name} must not be negative; got {value}.")
+                raise ValueError(f"InformationPolicyConfig.{setting.name} must not be negative; got {value}.")
         if self.n_gain_scenarios < 2:
             raise ValueError(
                 f"InformationPolicyConfig.n_gain_scenarios must be at least 2, to rank pulls and to refine them; "

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .detection import edges
+from .detection_metrics import edges
 
 MIN_LEVEL_COSINE = np.cos(np.radians(30))
 """Smallest vertical part of a level sheet's unit normal: such a sheet is drawn in the world's own x and y."""

@@ -21,7 +21,7 @@ from trimesh.triangles import closest_point, points_to_barycentric
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.truth import Truth, TruthFrame
 
-from .detection import edges
+from .detection_metrics import edges
 
 OBSERVABLE_LOAD = 2.4e-3
 """Load from which an attachment is distinguishable from the model's own error [N].

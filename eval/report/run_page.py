@@ -25,14 +25,14 @@ from jiggle_mj.observation import StereoPair
 from jiggle_mj.truth import Truth
 
 from ..metrics.calibration import reliability
-from ..metrics.detection import DILATIONS, GATE_VARIANCE, agreement, distances
+from ..metrics.detection_metrics import DILATIONS, GATE_VARIANCE, agreement, distances
 from ..metrics.flat_map import grid_of, outline, plane_of, spacing
 from ..metrics.tracking import tracking
 from ..metrics.truth_transfer import TransferredTruth, frame_at, stiffness_at, transfer
 from .pictures import pictures, state_of
 from .verdict import against_truth, doubts, found, stiffness_sums
 
-MAX_STEPS = 60
+MAX_SHOWN_STEPS = 60
 """Most frames on the slider."""
 MAX_PARTICLE_STEPS = 120_000
 """Most particles times frames on the slider, for each of estimate and truth: about 4 MB of numbers."""
@@ -103,7 +103,7 @@ def write_report(
     comparison = None
     sentences = [found(sheet, detection, plane_of(sheet.rest))]
     if truth is not None and transferred is not None:
-        comparison = _comparison(sheet, estimates, belief, detection, truth, transferred)
+        comparison = _comparison(sheet, estimates, detection, truth, transferred)
         sentences += [
             against_truth(sheet, detection, transferred),
             stiffness_sums(sheet, belief, detection, transferred),
@@ -234,7 +234,6 @@ def _truth_steps(truth: Truth, estimates: Sequence[Estimate], kept: Sequence[int
 def _comparison(
     sheet: Sheet,
     estimates: Sequence[Estimate],
-    belief: Belief,
     detection: Detection,
     truth: Truth,
     transferred: TransferredTruth,
@@ -280,7 +279,7 @@ def _paths(estimates: Sequence[Estimate]) -> list[np.ndarray]:
 
 def shown_steps(estimates: Sequence[Estimate], rest: np.ndarray) -> list[int]:
     """Return the positions in `estimates` of the frames on the slider, thinned evenly."""
-    count = min(len(estimates), MAX_STEPS, max(2, MAX_PARTICLE_STEPS // len(rest)))
+    count = min(len(estimates), MAX_SHOWN_STEPS, max(2, MAX_PARTICLE_STEPS // len(rest)))
     return np.unique(np.linspace(0, len(estimates) - 1, count).round().astype(int)).tolist()
 
 

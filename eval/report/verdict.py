@@ -7,7 +7,7 @@ import numpy as np
 
 from jiggle_mj.estimate import Belief, Detection, Sheet
 
-from ..metrics.detection import dilate, patches
+from ..metrics.detection_metrics import dilate, patches
 from ..metrics.flat_map import Plane
 from ..metrics.truth_transfer import TransferredTruth
 

@@ -17,7 +17,7 @@ from jiggle_mj.episode import OnFrame, check_directory, clear_directory
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.estimator import EstimatorConfig
-from jiggle_mj.estimator.attribution.closing import close_the_loop
+from jiggle_mj.estimator.attribution.close_loop import close_the_loop
 from jiggle_mj.estimator.attribution.dataset import collect_dataset
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
 from jiggle_mj.estimator.attribution.suggestion import suggest
@@ -28,8 +28,8 @@ from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.truth import Truth
 
+from ..metrics.result import agreements
 from ..metrics.result_file import Json
-from ..metrics.score import agreements
 from ..metrics.truth_transfer import transfer
 from ..report.discrepancy_page import write_page
 

@@ -37,8 +37,8 @@ from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.recording.reader import Recording
 from jiggle_mj.truth import Truth
 
+from ..metrics.result import Run, result, score_read
 from ..metrics.result_file import IDENTITY, RECORDED, Json, read_scorable, write_result
-from ..metrics.score import Run, result, score_read
 from ..report.run_page import shown_steps, write_report
 from .acting import actions, acts, check_policy_fits, policy_named
 

@@ -22,7 +22,7 @@ from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.scenes import load_scene
 
-from ..metrics.detection import dilate
+from ..metrics.detection_metrics import dilate
 from ..metrics.result_file import Json, read_result
 from ..metrics.safety import AttachmentLoads, attachment_loads
 from ..metrics.truth_transfer import TransferredTruth, transfer

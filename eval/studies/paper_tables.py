@@ -18,8 +18,8 @@ from jiggle_mj.estimator.physics.simulator import HINGE_STIFFNESS, SWEEPS_PER_ST
 from jiggle_mj.scenes import Scene, load_scene
 from jiggle_mj.scenes.scene.programme import grasp_points
 
+from ..metrics.result import Run, result, with_truth
 from ..metrics.result_file import Json, read_result, write_result
-from ..metrics.score import Run, result, with_truth
 from ..runs.experiment import run_scene
 from .figures import Columns, figure_cells, is_scored
 from .same_engine import LIFT_INCREMENTS, LIFT_SHARE, POINT_SD, STIFFNESS_SHARE, Engine, same_engine

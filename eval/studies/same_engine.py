@@ -50,7 +50,7 @@ LIFT_INCREMENTS = 5
 """Moves of a lift."""
 FORCE_TOLERANCE = 1e-6
 """Largest residual force of an equilibrium [N]; a particle weighs 1.6e-4."""
-MAX_STEPS = 1000
+MAX_EQUILIBRIUM_STEPS = 1000
 """Most steps of the search for an equilibrium."""
 OPEN_TIP = np.array([0.0, 0.0, 0.5])
 """Place of the tip before the first grasp [m], far above the sheet."""
@@ -177,7 +177,7 @@ def _equilibrium(mesh: SheetMesh, declaration: Declaration, b):
 
     def step(x, grip):
         gripped = SheetEnergy.build(mesh.rest, (*energy.terms, grip), energy.layout)
-        found = search(gripped, b, jnp.asarray(x), force_tolerance=FORCE_TOLERANCE, max_steps=MAX_STEPS)
+        found = search(gripped, b, jnp.asarray(x), force_tolerance=FORCE_TOLERANCE, max_steps=MAX_EQUILIBRIUM_STEPS)
         if not found.converged:
             raise RuntimeError(
                 f"the equilibrium of the truth did not converge: the residual is {float(found.force):.2g} N after "

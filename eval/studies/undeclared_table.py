@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import norm
 
 from jiggle_mj.episode import observe
-from jiggle_mj.estimator.attribution.closing import UNEXPLAINED
+from jiggle_mj.estimator.attribution.close_loop import UNEXPLAINED
 from jiggle_mj.recording.declaration import is_current
 from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.scenes import Reference, programme

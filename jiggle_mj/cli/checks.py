@@ -10,7 +10,7 @@ import tyro
 from rich.table import Table
 
 from .options import AsJson, Disturb, Name
-from .terminal import console, log
+from .terminal import FAILED, console, log
 
 
 def bench(
@@ -51,7 +51,7 @@ def bench(
     for line in worse:
         console.print(line, style="red", highlight=False)
     if worse:
-        sys.exit(1)
+        sys.exit(FAILED)
 
 
 def scene_check(scene: Name, /, *, disturb: Disturb = (), as_json: AsJson = False) -> None:
@@ -102,4 +102,4 @@ def doctor(*, as_json: AsJson = False) -> None:
     if as_json:
         print(json.dumps([asdict(check) for check in checks]))
     if not all(check.ok for check in checks):
-        sys.exit(1)
+        sys.exit(FAILED)

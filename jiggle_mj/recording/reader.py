@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from ..camera import StereoCamera
 from ..errors import RecordingError
 from ..observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolReport, ToolState
-from .contents import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, RecordingContents
+from .checked_contents import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, RecordingContents
 from .frames import transform_of_rotation
 from .pairing import MessageGroup, Stamped, group_messages
 from .schemas import decode_image, parse_calibration, parse_points, parse_transform

@@ -197,11 +197,22 @@ def _refuse_contradiction(
             )
 
 
+def attach(
+    attachments: tuple[Attachment, ...], vertices: Float[np.ndarray, "n 2"]
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the owner of each vertex (see `owners`), and the stiffness of its attachment [N/m].
+
+    The stiffness is 0 where the vertex is free and infinite where it is welded.
+
+    Raises:
+        SceneError: a shape holds no vertex, or two shapes disagree about one.
+    """
+    owner = owners(attachments, vertices)
+    return owner, vertex_values(attachments, owner, "stiffness")
+
+
 def vertex_values(
     attachments: tuple[Attachment, ...], owner: Int[np.ndarray, " n"], key: str, *, free: object = 0.0
 ) -> Float[np.ndarray, "n ..."]:
-    """Return the value of one key of `Attachment` at each vertex, by `owners`; `free` where nothing holds it.
-
-    The stiffness [N/m] is infinite where the vertex is welded.
-    """
+    """Return the value of one key of `Attachment` at each vertex, by `owners`; `free` where nothing holds it."""
     return np.array([getattr(attachments[index], key) if index >= 0 else free for index in owner], dtype=float)

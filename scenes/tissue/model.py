@@ -26,7 +26,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..scene.attachments import owners, vertex_values
+from ..scene.attachments import attach
 from ..scene.disturbance import TissueDisturbance
 from ..scene.scene import Scene, TextureConfig
 from .cameras import add_cameras
@@ -106,8 +106,7 @@ def build_tissue(scene: Scene, *, drawn: bool = True) -> TissueModel:
     """
     tissue = scene.tissue
     sheet = build_sheet(size=tissue.size, spacing=tissue.spacing, kind=tissue.mesh, seed=tissue.seed)
-    owner = owners(scene.attachments, sheet.vertices)
-    stiffness = vertex_values(scene.attachments, owner, "stiffness")
+    owner, stiffness = attach(scene.attachments, sheet.vertices)
     spec = mujoco.MjSpec()
     spec.modelname = scene.name
     _set_options(spec, scene)

@@ -8,7 +8,7 @@ import pytest
 
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.physics.surrogate import surrogate
-from jiggle_mj.eval.metrics.detection import agreement
+from jiggle_mj.eval.metrics.detection_metrics import agreement
 from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
 from tests.support.small_sheet import DECLARATION, GRIP_RADIUS, equilateral, gripped, jittered, search
 

@@ -9,7 +9,7 @@ import trimesh
 
 from jiggle_mj.errors import MeshError, PerceptionError, RecordingError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
-from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
+from jiggle_mj.estimator.belief.gaussian_belief import GaussianBelief
 from jiggle_mj.estimator.filters.nnls import NonNegativeLeastSquares
 from jiggle_mj.estimator.filters.posterior_summary import Convergence, PosteriorSummary
 from jiggle_mj.estimator.perception import Track
@@ -332,7 +332,7 @@ def test_a_belief_that_is_no_number_when_the_jaws_open_is_refused_and_the_last_o
         estimator.update(one)
     before, none = estimator.detection, jnp.full(sheet().n, jnp.nan)
     spoilt = PosteriorSummary(
-        belief=BoundaryBelief.prior(sheet().n, mean=0.0, sd=1.0),
+        belief=GaussianBelief.prior(sheet().n, mean=0.0, sd=1.0),
         b=none,
         sd=none,
         probability=none,

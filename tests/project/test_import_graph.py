@@ -158,7 +158,7 @@ def test_imports_run_one_way():
         ("estimator/perception/flow.py", "from .. import eval, belief\nfrom jiggle_mj import eval"),
         ("scenes/tissue.py", "from jiggle_mj.estimator.physics.mesh import lattice"),
         ("scenes/tissue.py", "import jax.numpy as jnp"),
-        ("scenes/tissue.py", "import jiggle_mj.eval.metrics.detection"),
+        ("scenes/tissue.py", "import jiggle_mj.eval.metrics.detection_metrics"),
         ("jiggle_mj/camera.py", "from jiggle_mj.estimator import mesh"),
         ("jiggle_mj/observation.py", "from jiggle_mj.truth import Truth"),
         ("jiggle_mj/recording.py", "from jiggle_mj.truth import Truth"),

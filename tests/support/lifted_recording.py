@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jiggle_mj.estimator.attribution.closing import Closed, close_the_loop
+from jiggle_mj.estimator.attribution.close_loop import Closed, close_the_loop
 from jiggle_mj.estimator.attribution.dataset import Dataset, collect_dataset
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.blas import one_thread

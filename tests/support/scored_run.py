@@ -8,8 +8,8 @@ import numpy as np
 
 from jiggle_mj.episode import Episode
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.eval.metrics.result import Run, result, with_truth
 from jiggle_mj.eval.metrics.result_file import IDENTITY, RECORDED, write_result
-from jiggle_mj.eval.metrics.score import Run, result, with_truth
 from jiggle_mj.limits import Limits
 from jiggle_mj.recording.estimate import EstimateWriter
 from jiggle_mj.recording.truth import write_truth

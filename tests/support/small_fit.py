@@ -5,11 +5,11 @@ from functools import cache
 import jax.numpy as jnp
 import numpy as np
 
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, FrameHistory, Timed
 from jiggle_mj.estimator.attribution.fit import Fitted
+from jiggle_mj.estimator.attribution.grasped_frames import ClosedFrame, FrameHistory, Timed
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import PredictedSheet
-from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
+from jiggle_mj.estimator.belief.gaussian_belief import GaussianBelief
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.estimator.effects.sheet_model import centred
 from jiggle_mj.estimator.filters.posterior_summary import PosteriorSummary
@@ -51,7 +51,7 @@ def small_fit(*, theta: np.ndarray | None = None, named: np.ndarray | None = Non
     point = Point(theta=theta, s=np.zeros(1), states=np.zeros((0, 1, 3)), seen=np.zeros((0, 1, 3)))
     nothing, zero = jnp.zeros(1), jnp.zeros(())
     summary = PosteriorSummary(
-        belief=BoundaryBelief.prior(1, mean=0.0, sd=1.0),
+        belief=GaussianBelief.prior(1, mean=0.0, sd=1.0),
         b=nothing,
         sd=nothing,
         probability=nothing,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jiggle_mj.estimator.attribution.closed_frames import ClosedFrame, Timed
+from jiggle_mj.estimator.attribution.grasped_frames import ClosedFrame, Timed
 from jiggle_mj.estimator.attribution.held_shape import another_shape
 
 ROW = np.stack([np.linspace(-0.1, 0.1, 7), np.zeros(7), np.zeros(7)], axis=1)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
+from jiggle_mj.estimator.belief.gaussian_belief import GaussianBelief
 from jiggle_mj.estimator.filters.evidence import Evidence, Pull
 from jiggle_mj.estimator.filters.explicit import non_negative, update
 from jiggle_mj.estimator.filters.shots import ShotHistory, Shots, draw_samples, predicted
@@ -22,7 +22,7 @@ NOISE, STIFFNESS = 1e-4, 3.0
 ATTACHED = np.linalg.norm(MESH.rest, axis=1) < 9e-3
 
 
-def updated(belief: BoundaryBelief, shots: Shots, b: jax.Array | None = None) -> BoundaryBelief:
+def updated(belief: GaussianBelief, shots: Shots, b: jax.Array | None = None) -> GaussianBelief:
     """Return the belief after an update linearised at b, by default at the mean where that is not negative."""
     return update(SIMULATOR, belief, jnp.maximum(belief.mean(), 0) if b is None else b, shots, sweeps=SWEEPS)[0]
 
@@ -66,7 +66,7 @@ def lift() -> list[Shots]:
 
 def test_an_update_is_the_papers_equations(lift):
     """Three stacked samples agree with K = Sigma J^T (J Sigma J^T + V)^-1, J by finite differences."""
-    belief = BoundaryBelief.prior(MESH.n, mean=0.5, sd=1.0)
+    belief = GaussianBelief.prior(MESH.n, mean=0.5, sd=1.0)
     three = stacked([lift[1], lift[8], lift[5]])
     after, _, nis = update(SIMULATOR, belief, belief.mean(), three, sweeps=SWEEPS)
     found_mean, found_covariance = after.moments()
@@ -90,7 +90,7 @@ def predicted_stack(samples: Shots, b) -> jax.Array:
 
 
 def test_a_missing_particle_has_no_influence(lift):
-    belief = BoundaryBelief.prior(MESH.n, mean=0.0, sd=1.0)
+    belief = GaussianBelief.prior(MESH.n, mean=0.0, sd=1.0)
     unseen = lift[3].precision.at[0, 7].set(0.0)
     one = eqx.tree_at(lambda s: s.precision, lift[3], unseen)
     other = eqx.tree_at(lambda s: s.end, one, one.end.at[0, 7].add(0.3))
@@ -98,9 +98,9 @@ def test_a_missing_particle_has_no_influence(lift):
     np.testing.assert_allclose(updated(belief, one).shift, updated(belief, other).shift, rtol=1e-12)  # rounding
 
 
-def filtered(samples: list[Shots]) -> tuple[BoundaryBelief, np.ndarray]:
+def filtered(samples: list[Shots]) -> tuple[GaussianBelief, np.ndarray]:
     """Return belief and constrained mean after one sample in each frame, from the paper's prior mean."""
-    belief, b = BoundaryBelief.prior(MESH.n, mean=1e-4, sd=3.0), jnp.zeros(MESH.n)
+    belief, b = GaussianBelief.prior(MESH.n, mean=1e-4, sd=3.0), jnp.zeros(MESH.n)
     for sample in samples:
         belief = updated(belief, sample, b)
         b = non_negative(belief, b)
@@ -115,7 +115,7 @@ def test_attached_particles_rank_above_all_others_on_its_own_simulator(lift):
 
 def test_what_is_seen_is_evidence_for_the_b_that_was_simulated(lift):
     """A sheet that moves as f(b = 0) is evidence for b = 0, without a shift, also where the mean is below 0."""
-    belief, nothing = BoundaryBelief.prior(MESH.n, mean=-0.5, sd=1.0), jnp.zeros(MESH.n)
+    belief, nothing = GaussianBelief.prior(MESH.n, mean=-0.5, sd=1.0), jnp.zeros(MESH.n)
     agreeing = eqx.tree_at(lambda shot: shot.end, lift[3], predicted_stack(lift[3], nothing))
     after = updated(belief, agreeing, nothing)
     assert np.diagonal(after.precision).max() > 2

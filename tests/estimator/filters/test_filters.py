@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
+from jiggle_mj.estimator.belief.gaussian_belief import GaussianBelief
 from jiggle_mj.estimator.filters.adam import RATE, AdamShooting
 from jiggle_mj.estimator.filters.evidence import Evidence, Pull
 from jiggle_mj.estimator.filters.explicit import MultipleShooting
@@ -33,7 +33,7 @@ HIDDEN_ROUNDING = 1e-9
 
 def gaussian(*, mean: float = 1e-4) -> dict[str, Any]:
     """Return the prior of the filters over stiffnesses, with a standard deviation of 1 N/m."""
-    return {"prior": BoundaryBelief.prior(N, mean=mean, sd=1.0), "prior_sd": 1.0}
+    return {"prior": GaussianBelief.prior(N, mean=mean, sd=1.0), "prior_sd": 1.0}
 
 
 def implicit() -> Filter:

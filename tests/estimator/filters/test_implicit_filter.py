@@ -14,7 +14,7 @@ from jiggle_mj.estimator.filters.config import FilterConfig
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter, ImplicitState
 from jiggle_mj.estimator.filters.posterior_summary import Convergence
-from jiggle_mj.eval.metrics.detection import dilate
+from jiggle_mj.eval.metrics.detection_metrics import dilate
 from tests.support.small_sheet import (
     STIFFNESS,
     Lift,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief
+from jiggle_mj.estimator.belief.gaussian_belief import GaussianBelief
 from jiggle_mj.estimator.planning.objectives import (
     boundary_energy,
     log_shrinkage,
@@ -67,7 +67,7 @@ def test_the_shrinkage_is_twice_the_fall_of_the_entropy(state):
     """By the filter's own update in information form, with the 1/2 that the paper's entropy lacks."""
     *_, covariance = state
     dx_db = jnp.asarray(np.random.default_rng(1).normal(size=(N, 4, 3)))
-    before = BoundaryBelief(precision=jnp.linalg.inv(covariance), shift=jnp.zeros(N))
+    before = GaussianBelief(precision=jnp.linalg.inv(covariance), shift=jnp.zeros(N))
     flat = dx_db.reshape(N, -1)
     after = before.add(flat @ flat.T / 0.3**2, jnp.zeros(N))
     assert log_shrinkage(dx_db, covariance, 0.3) == pytest.approx(2 * (after.entropy() - before.entropy()))

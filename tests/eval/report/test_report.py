@@ -19,7 +19,7 @@ from jiggle_mj.episode import Episode
 from jiggle_mj.errors import OutputError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.eval.metrics.flat_map import grid_of, outline, plane_of
-from jiggle_mj.eval.metrics.score import Run, result, with_truth
+from jiggle_mj.eval.metrics.result import Run, result, with_truth
 from jiggle_mj.eval.metrics.truth_transfer import TransferredTruth, transfer
 from jiggle_mj.eval.report.pictures import pictures
 from jiggle_mj.eval.report.run_page import write_report

@@ -10,7 +10,7 @@ from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.mesh import SheetMesh
 from jiggle_mj.estimator.physics.simulator import SWEEPS_PER_STEP, simulator
 from jiggle_mj.estimator.physics.surrogate import surrogate
-from jiggle_mj.eval.metrics.detection import agreement
+from jiggle_mj.eval.metrics.detection_metrics import agreement
 from jiggle_mj.eval.studies.paper_tables import EXACT_FORCE_SD
 from jiggle_mj.eval.studies.same_engine import (
     FORCE_TOLERANCE,

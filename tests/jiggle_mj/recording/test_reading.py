@@ -13,7 +13,7 @@ from jiggle_mj.observation import (
     Declaration,
     MeasuredPoints,
 )
-from jiggle_mj.recording.contents import GRASP, LEFT, POINTS, POSE, RIGHT, TF
+from jiggle_mj.recording.checked_contents import GRASP, LEFT, POINTS, POSE, RIGHT, TF
 from jiggle_mj.recording.frames import camera_transforms
 from jiggle_mj.recording.pairing import Stamped, group_messages
 from jiggle_mj.recording.reader import Recording

@@ -12,7 +12,7 @@ from jiggle_mj.errors import RecordingError
 from jiggle_mj.observation import (
     Declaration,
 )
-from jiggle_mj.recording.contents import GRASP, LEFT, LEFT_INFO, POINTS, RIGHT_INFO, TF
+from jiggle_mj.recording.checked_contents import GRASP, LEFT, LEFT_INFO, POINTS, RIGHT_INFO, TF
 from jiggle_mj.recording.declaration import DECLARATION, DECLARED_MESH
 from jiggle_mj.recording.frames import camera_transforms
 from jiggle_mj.recording.mcap_files import McapOutput

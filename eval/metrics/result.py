@@ -20,7 +20,7 @@ from jiggle_mj.recording.estimate import EstimateRecording
 from jiggle_mj.truth import Truth
 
 from .calibration import Calibration, calibration
-from .detection import DILATIONS, agreement, average_precision
+from .detection_metrics import DILATIONS, agreement, average_precision
 from .result_file import Json, read_scorable, write_result
 from .safety import attachment_loads
 from .tracking import tracking

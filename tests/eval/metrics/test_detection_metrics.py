@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jiggle_mj.estimate import Estimate, Sheet
-from jiggle_mj.eval.metrics.detection import agreement, average_precision, dilate, distances, patches
+from jiggle_mj.eval.metrics.detection_metrics import agreement, average_precision, dilate, distances, patches
 from jiggle_mj.eval.metrics.safety import attachment_loads
 from jiggle_mj.eval.metrics.tracking import tracking
 from jiggle_mj.eval.metrics.truth_transfer import barycentric_weights, transfer

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jiggle_mj.errors import OutputError, RecordingError
+from jiggle_mj.eval.metrics.result import score
 from jiggle_mj.eval.metrics.result_file import read_result
-from jiggle_mj.eval.metrics.score import score
 from jiggle_mj.limits import Limits
 from jiggle_mj.recording.estimate import EstimateWriter
 from jiggle_mj.recording.truth import write_truth

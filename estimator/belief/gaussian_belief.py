@@ -22,7 +22,7 @@ MAX_EXCHANGES_PER_PARTICLE = 5
 """Exchanges over particles after which the search ends, where rounding keeps it from settling."""
 
 
-class BoundaryBelief(eqx.Module):
+class GaussianBelief(eqx.Module):
     """Gaussian N(mean, covariance) over b in information form."""
 
     precision: Float[Array, "n n"]
@@ -31,19 +31,19 @@ class BoundaryBelief(eqx.Module):
     """Precision times mean, eta = Lambda mean [m/N]."""
 
     @classmethod
-    def prior(cls, n: int, *, mean: float, sd: float) -> "BoundaryBelief":
+    def prior(cls, n: int, *, mean: float, sd: float) -> "GaussianBelief":
         """Return independent particles, each with this mean and standard deviation [N/m]."""
         return cls(precision=jnp.eye(n) / sd**2, shift=jnp.full(n, mean / sd**2, dtype=float))
 
-    def add(self, precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> "BoundaryBelief":
+    def add(self, precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> "GaussianBelief":
         """Return the belief after independent evidence in information form."""
-        return BoundaryBelief(precision=self.precision + precision, shift=self.shift + shift)
+        return GaussianBelief(precision=self.precision + precision, shift=self.shift + shift)
 
-    def predict(self, change: Float[Array, " n"], variance: Float[Array, " n"]) -> "BoundaryBelief":
+    def predict(self, change: Float[Array, " n"], variance: Float[Array, " n"]) -> "GaussianBelief":
         """Predict b after a cut or suture: b + delta_b [N/m] with noise of diagonal covariance W [N^2/m^2]."""
         mean, covariance = self.moments()
         after = GaussianInformation.from_moments(mean + change, covariance + jnp.diag(variance))
-        return BoundaryBelief(precision=jnp.asarray(after.precision), shift=jnp.asarray(after.shift))
+        return GaussianBelief(precision=jnp.asarray(after.precision), shift=jnp.asarray(after.shift))
 
     @property
     def information(self) -> GaussianInformation:
@@ -81,7 +81,7 @@ class BoundaryBelief(eqx.Module):
 def non_negative_minimum(
     precision: Float[Array, "n n"], shift: Float[Array, " n"], free: Bool[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Return argmin 1/2 z^T A z - c^T z over z >= 0, A positive definite; see `BoundaryBelief.non_negative_mean`."""
+    """Return argmin 1/2 z^T A z - c^T z over z >= 0, A positive definite; see `GaussianBelief.non_negative_mean`."""
     n = len(shift)
     scale = jnp.sqrt(jnp.diagonal(precision))
     A, c = precision / scale[:, None] / scale[None, :], shift / scale

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import nnls
 from scipy.stats import multivariate_normal
 
-from jiggle_mj.estimator.belief.boundary_belief import BoundaryBelief, non_negative_minimum
+from jiggle_mj.estimator.belief.gaussian_belief import GaussianBelief, non_negative_minimum
 
 ROUNDING = 1e-9
 """Relative; matrices here have condition numbers below 1e5."""
@@ -25,13 +25,13 @@ def positive_definite(seed: int, n: int = N, scale: float = 1.0) -> np.ndarray:
     return scale * root @ root.T
 
 
-def belief(seed: int = 0) -> BoundaryBelief:
+def belief(seed: int = 0) -> GaussianBelief:
     precision = positive_definite(seed)
-    return BoundaryBelief(precision=jnp.asarray(precision), shift=jnp.asarray(precision @ np.linspace(-1, 2, N)))
+    return GaussianBelief(precision=jnp.asarray(precision), shift=jnp.asarray(precision @ np.linspace(-1, 2, N)))
 
 
 def test_a_prior_has_its_mean_and_standard_deviation():
-    mean, covariance = BoundaryBelief.prior(4, mean=0.5, sd=0.2).moments()
+    mean, covariance = GaussianBelief.prior(4, mean=0.5, sd=0.2).moments()
     np.testing.assert_allclose(mean, 0.5)
     np.testing.assert_allclose(covariance, 0.04 * np.eye(4), rtol=1e-12)
 
