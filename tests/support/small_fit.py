@@ -12,7 +12,7 @@ from jiggle_mj.estimator.attribution.sheet import PredictedSheet
 from jiggle_mj.estimator.belief.gaussian_belief import GaussianBelief
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.estimator.effects.sheet_model import centred
-from jiggle_mj.estimator.filters.posterior_summary import PosteriorSummary
+from jiggle_mj.estimator.filters.posterior_summary import Convergence, PosteriorSummary
 from tests.support.small_sheet import sheet, sheet_balance, sheet_prior
 
 
@@ -56,7 +56,7 @@ def small_fit(*, theta: np.ndarray | None = None, named: np.ndarray | None = Non
         sd=nothing,
         probability=nothing,
         entropy=zero,
-        converged=jnp.asarray(True),
+        convergence=Convergence.CONVERGED.code,
     )
     return Fitted(
         point=point,
