@@ -30,7 +30,7 @@ from .scene.scene import (
     TissueConfig,
     TweezerConfig,
 )
-from .scene.section import Section
+from .scene.section import Section, checked
 
 SECTIONS: dict[str, type[Section]] = {
     cls.section: cls
@@ -133,7 +133,7 @@ def _section(cls: type[Section], table: object, *, where: str) -> Any:
     if missing:
         raise SceneError(f"{where} lacks {', '.join(missing)}.")
     try:
-        return cls(**table)
+        return cls(**{f.name: checked(f, table[f.name], where=where) for f in fields(cls) if f.name in table})
     except SceneError as error:
         raise SceneError(str(error).replace(f"{cls.section}.", f"{where}.", 1)) from None
 
