@@ -27,11 +27,11 @@ demo: $(SET_UP)
 	$(BIN)/jiggle-mj run arc --out out/demo --overwrite
 
 test: $(SET_UP)
-	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
+	$(BIN)/pytest -m "not slow" -n 2 --dist loadgroup
 
 # All other tests compile without optimisation, for speed: what they say of bits holds for another program.
 defaults: $(SET_UP)
-	XLA_FLAGS= $(BIN)/pytest -m "bits and not slow"
+	XLA_FLAGS= $(BIN)/pytest -m "bits and not slow" -n 2
 
 # PYTHONS names them: those on PATH, and pyenv's.
 PYTHONS ?= $(foreach v,3.12 3.13,$(firstword $(wildcard $(HOME)/.pyenv/versions/$(v).*/bin/python) $(shell command -v python$(v))))

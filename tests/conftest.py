@@ -45,6 +45,18 @@ MAPS = 30_000
 each compiled function, dies of the lack of one."""
 
 
+SHARED = ("light", "one_by_one")
+"""Fixtures of a session that take a minute: who needs one goes to the process that has it."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep the tests of a file in one process, and those of a shared fixture (xdist's --dist loadgroup)."""
+    for item in items:
+        needs = [name for name in SHARED if name in getattr(item, "fixturenames", ())]
+        item.add_marker(pytest.mark.xdist_group(needs[0] if needs else item.path.stem))
+
+
 @pytest.fixture(autouse=True, scope="module")
 def room_for_compiled_functions() -> Iterator[None]:
     """Drop what was compiled, after a file of tests, if there is much of it."""

@@ -35,7 +35,6 @@ def estimated(path, out) -> bytes:
     return out.read_bytes()
 
 
-@pytest.mark.bits
 def test_a_scrambled_truth_leaves_the_estimate_equal_to_the_byte(recording, tmp_path):
     path, _ = recording
     before = estimated(path, tmp_path / "one.mcap")
@@ -51,7 +50,6 @@ def test_a_scrambled_truth_leaves_the_estimate_equal_to_the_byte(recording, tmp_
         truth.write_bytes(kept)
 
 
-@pytest.mark.bits
 def test_the_recording_gives_the_same_estimate_as_the_live_tissue(recording, tmp_path):
     """The estimate during the simulation equals the estimate from the file, byte by byte."""
     path, seen = recording

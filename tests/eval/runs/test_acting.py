@@ -79,6 +79,7 @@ def test_ours_looks_grasps_and_pulls_in_steps_and_learns(ours):
     assert loop.entropy[-1] < loop.entropy[0] < loop.estimator.prior_entropy
 
 
+@pytest.mark.slow
 def test_the_same_seed_plans_the_same(scene, ours):
     again = policy_named("information", scene, seed=0)
     assert again is not None
@@ -122,6 +123,7 @@ def test_where_nothing_is_safe_nothing_is_grasped_and_it_says_so(scene):
     assert policy.ended.startswith("no safe pull teaches ") and "not decided" in policy.ended
 
 
+@pytest.mark.slow
 def test_where_nothing_is_safe_the_command_says_why_nothing_was_estimated(tmp_path, monkeypatch, capsys):
     unsafe = scene_file(tmp_path, text=SCENE + "[limits]\nforce = 1e-9\nenergy = 1e-20\n")
     for policy, why in (
@@ -279,6 +281,7 @@ class Corners(InformationPolicy):
         return Move(to=self._point + np.array([0, 0, height])), "higher"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, fails):
     scene = load_scene(str(scene_file(tmp_path, text=SCENE + f"[procedure]\ncut_fails = {int(fails)}\n")))
