@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from ..physics.mesh import SheetMesh
+from ..ranges import check_ranges
 from .attachment_belief import AttachmentBelief
 from .attachment_prior import AttachmentPrior
 from .config import BeliefConfig
@@ -35,9 +36,7 @@ class PriorConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("spike", "spread", "dirichlet_strength"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"PriorConfig.{name} must be above 0; got {getattr(self, name)}.")
+        check_ranges(self, positive=("spike", "spread", "dirichlet_strength"))
         for name in ("partial", "probability"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"PriorConfig.{name} must lie between 0 and 1; got {getattr(self, name)}.")

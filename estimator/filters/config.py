@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, fields
 
+from ..ranges import check_ranges
+
 
 @dataclass(frozen=True, kw_only=True)
 class FilterConfig:
@@ -35,7 +37,7 @@ class FilterConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        _check_positive(self)
+        check_ranges(self, positive=tuple(item.name for item in fields(self)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +57,7 @@ class SamplingConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        _check_positive(self)
+        check_ranges(self, positive=tuple(item.name for item in fields(self)))
 
     @property
     def quick(self) -> tuple[int, int]:
@@ -66,9 +68,3 @@ class SamplingConfig:
     def thorough(self) -> tuple[int, int]:
         """Rounds and doublings of samples at the end of a thorough refinement."""
         return self.thorough_rounds, self.thorough_doublings
-
-
-def _check_positive(config: FilterConfig | SamplingConfig) -> None:
-    for field in fields(config):
-        if not (value := getattr(config, field.name)) > 0:
-            raise ValueError(f"{type(config).__name__}.{field.name} must be above 0; got {value}.")
