@@ -10,6 +10,9 @@ stays the same from frame to frame, as most of what a model lacks does, adds up 
 1992, doi:10.1162/neco.1992.4.3.415, for the degrees of freedom]. A ratio of the two above 1 is the factor by which the
 variance was too small. A variance is only ever inflated above the assumed one, never reduced: the fit of s absorbs part
 of both noises, and data hold little evidence about a noise that is smaller than the other.
+
+`Evidence.inflated` and `ForceBalance.inflated` apply the factors to a frame. The fixed factor
+`StereoTrackerConfig.variance_inflation` is another: it is part of what perception states.
 """
 
 from collections.abc import Sequence

@@ -22,10 +22,11 @@ from scipy.spatial.transform import Rotation
 from ..camera import StereoCamera
 from ..errors import RecordingError
 from ..observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolReport, ToolState
-from .checked_contents import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, RecordingContents
+from .contents import RecordingContents
 from .frames import transform_of_rotation
 from .pairing import MessageGroup, Stamped, group_messages
 from .schemas import decode_image, parse_calibration, parse_points, parse_transform
+from .topics import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO
 
 PAIRING_TOLERANCE_NS = 5_000_000
 """Default largest difference between the stamps of one group [ns]; the sensors of a robot stamp a few ms apart."""

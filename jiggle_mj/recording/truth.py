@@ -1,4 +1,4 @@
-"""The truth of a recording, in a separate file under `/truth/` topics, which `checked_contents` refuses.
+"""The truth of a recording, in a separate file under `/truth/` topics, which `refusals` keeps from the estimator.
 
 The reference tissue or an importer writes it; only `jiggle_mj.eval` reads it.
 """

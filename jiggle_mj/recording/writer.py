@@ -13,7 +13,6 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 
 from ..camera import StereoCamera
 from ..observation import Declaration, MeasuredPoints, Observation
-from .checked_contents import EVENT, GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
 from .declaration import METADATA, file_metadata, write_declaration
 from .events import EVENT_SCHEMA, event_json
 from .frames import camera_transforms
@@ -26,6 +25,7 @@ from .schemas import (
     point_cloud,
     pose_message,
 )
+from .topics import EVENT, GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
 
 
 class RecordingWriter:

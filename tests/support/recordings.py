@@ -16,7 +16,6 @@ from jiggle_mj.observation import (
     ToolReport,
     ToolState,
 )
-from jiggle_mj.recording.checked_contents import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
 from jiggle_mj.recording.frames import camera_transforms
 from jiggle_mj.recording.mcap_files import McapOutput
 from jiggle_mj.recording.reader import Recording
@@ -28,6 +27,7 @@ from jiggle_mj.recording.schemas import (
     point_cloud,
     pose_message,
 )
+from jiggle_mj.recording.topics import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
 from jiggle_mj.recording.writer import RecordingWriter
 from jiggle_mj.truth import Truth, TruthFrame
 

@@ -13,7 +13,6 @@ from jiggle_mj.observation import (
     Declaration,
     MeasuredPoints,
 )
-from jiggle_mj.recording.checked_contents import GRASP, LEFT, POINTS, POSE, RIGHT, TF
 from jiggle_mj.recording.frames import camera_transforms
 from jiggle_mj.recording.pairing import Stamped, group_messages
 from jiggle_mj.recording.reader import Recording
@@ -26,6 +25,7 @@ from jiggle_mj.recording.schemas import (
     point_cloud,
     pose_message,
 )
+from jiggle_mj.recording.topics import GRASP, LEFT, POINTS, POSE, RIGHT, TF
 from tests.support.recordings import MS, ROUNDING, Bag, camera, image, read_all, tool
 
 JPEG_LOSS = 3

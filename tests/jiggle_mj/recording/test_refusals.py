@@ -12,7 +12,6 @@ from jiggle_mj.errors import RecordingError
 from jiggle_mj.observation import (
     Declaration,
 )
-from jiggle_mj.recording.checked_contents import GRASP, LEFT, LEFT_INFO, POINTS, RIGHT_INFO, TF
 from jiggle_mj.recording.declaration import DECLARATION, DECLARED_MESH
 from jiggle_mj.recording.frames import camera_transforms
 from jiggle_mj.recording.mcap_files import McapOutput
@@ -22,6 +21,7 @@ from jiggle_mj.recording.schemas import (
     calibration_message,
     point_cloud,
 )
+from jiggle_mj.recording.topics import GRASP, LEFT, LEFT_INFO, POINTS, RIGHT_INFO, TF
 from jiggle_mj.recording.truth import write_truth
 from tests.support.recordings import Bag, camera, image, observations, truth, write
 

@@ -16,7 +16,6 @@ from jiggle_mj.observation import (
     Declaration,
     DeclaredMesh,
 )
-from jiggle_mj.recording.checked_contents import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, SCHEMAS, TF
 from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.schemas import (
     calibration_message,
@@ -24,6 +23,7 @@ from jiggle_mj.recording.schemas import (
     parse_transform,
     timestamp,
 )
+from jiggle_mj.recording.topics import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, SCHEMAS, TF
 from jiggle_mj.recording.writer import RecordingWriter
 from tests.support.recordings import (
     QUATERNION_ROUNDING,

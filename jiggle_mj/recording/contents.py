@@ -1,7 +1,7 @@
 """The contents of a recording's file: its topics, its small messages, and the place of its images and points.
 
-Reads the topics of `SCHEMAS` and the JSON ones, counts the messages of others, refuses truth and files that are no
-recordings. Images and points are handed out later, still encoded: `pairing` groups them into frames, `reader` turns
+Reads the topics of `topics.SCHEMAS` and the JSON ones, and counts the messages of others; `refusals` says what is no
+recording. Images and points are handed out later, still encoded: `pairing` groups them into frames, `reader` turns
 them into observations.
 """
 
@@ -11,11 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration as CalibrationMessage
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from mcap.records import Channel, Message, Metadata, Schema
 
@@ -27,23 +24,9 @@ from .events import parse_event
 from .frames import FrameTree
 from .mcap_files import iterate_records
 from .pairing import Stamped
+from .refusals import refuse_incomplete, refuse_truth
 from .schemas import parse_grasp, stamp_of
-
-LEFT, RIGHT = "/camera/left/image_raw", "/camera/right/image_raw"
-LEFT_INFO, RIGHT_INFO = "/camera/left/camera_info", "/camera/right/camera_info"
-TF, POSE, GRASP, POINTS, EVENT = "/tf", "/tool/pose", "/tool/grasp", "/tissue/points", "/event/topology"
-JSON_TOPICS = (GRASP, EVENT)
-"""Topics whose messages are JSON."""
-SCHEMAS: dict[str, tuple[Any, ...]] = {
-    LEFT: (CompressedImage, RawImage),
-    RIGHT: (CompressedImage, RawImage),
-    LEFT_INFO: (CalibrationMessage,),
-    RIGHT_INFO: (CalibrationMessage,),
-    TF: (FrameTransforms,),
-    POSE: (PoseInFrame,),
-    POINTS: (PointCloud,),
-}
-"""Topics that are read as protobuf, and the message classes allowed on each."""
+from .topics import EVENT, GRASP, JSON_TOPICS, LEFT, POINTS, POSE, RIGHT, SCHEMAS
 
 
 class RecordingContents:
@@ -75,7 +58,8 @@ class RecordingContents:
                 ignored[topic] += 1
         self.events.sort(key=lambda event: event[0])
         self.ignored = dict(sorted(ignored.items()))
-        self._refuse_incomplete()
+        present = {topic for topic, messages in self.stamped.items() if messages} | set(self.calibrations)
+        refuse_incomplete(path, present, self.ignored)
 
     @property
     def has_images(self) -> bool:
@@ -122,7 +106,7 @@ class RecordingContents:
             elif isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
-                self._refuse_truth(record.topic)
+                refuse_truth(self.path, record.topic)
                 topics[record.id] = record.topic
                 self._choose_class(record, schemas.get(record.schema_id))
             elif isinstance(record, Metadata):
@@ -154,32 +138,3 @@ class RecordingContents:
                 f"{self.path}: {channel.topic} is {name} ({encoding}); it must be {' or '.join(allowed)} (protobuf)."
             )
         self._classes[channel.id] = allowed[name]
-
-    def _refuse_truth(self, topic: str) -> None:
-        if topic.startswith("/truth/"):
-            name = self.path.name
-            advice = f" (pass {name.replace('.truth.', '.')})" if ".truth." in name else ""
-            raise RecordingError(f"{name} holds /truth topics; the estimator reads observations only{advice}.")
-
-    def _refuse_incomplete(self) -> None:
-        """Refuse a file that lacks the tool, both a stereo pair and points, or the calibration of its images."""
-        present = {topic for topic, messages in self.stamped.items() if messages} | set(self.calibrations)
-        sensors = f"{POINTS} or the pair {LEFT}, {RIGHT}"
-        if not present:
-            raise RecordingError(
-                f"{self.path} is foreign: it needs {POSE}, {GRASP} and {sensors}; "
-                f"its topics are: {', '.join(self.ignored) or 'none'}."
-            )
-        missing = [topic for topic in (POSE, GRASP) if topic not in present]
-        if bool(self.stamped[LEFT]) != bool(self.stamped[RIGHT]):
-            missing.append(LEFT if self.stamped[RIGHT] else RIGHT)
-        if not (self.has_images or self.stamped[POINTS]):
-            missing.append(sensors)
-        if missing:
-            raise RecordingError(
-                f"{self.path} lacks {' and '.join(missing)}; its topics are: "
-                f"{', '.join(sorted(present | set(self.ignored)))}."
-            )
-        uncalibrated = [topic for topic in (LEFT_INFO, RIGHT_INFO) if topic not in self.calibrations]
-        if self.has_images and uncalibrated:
-            raise RecordingError(f"{self.path} has images but no calibration: it lacks {' and '.join(uncalibrated)}.")
