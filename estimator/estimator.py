@@ -282,8 +282,7 @@ class Estimator:
         Raises:
             ValueError: asked before `begin` and before the first frame with closed jaws.
         """
-        _ = self._tracked
-        return self._perception.sheet()
+        return self._tracked.sheet
 
     @property
     def positions(self) -> Float[np.ndarray, "n 3"]:

@@ -23,6 +23,8 @@ from .physics.mesh import SheetMesh
 class TrackedSheet:
     """One sheet with its filter, the filter's state, and the latest positions."""
 
+    sheet: Sheet
+    """Rest shape and faces."""
     filter: Filter[Any]
     """The rule of update."""
     field: MeshField
@@ -48,6 +50,7 @@ class TrackedSheet:
         filter = build_filter(mesh, declaration, config)
         state = filter.init(jax.random.key(config.seed))
         return cls(
+            sheet=sheet,
             filter=filter,
             field=MeshField(plane.flatten(mesh.rest), mesh.faces),
             prior_entropy=float(state.summary.entropy),

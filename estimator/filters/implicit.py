@@ -278,10 +278,8 @@ def _updated(
     balance: ForceBalance, belief: AttachmentBelief, frame: Frame, information: FrameInformation, evidence: Evidence
 ) -> Update:
     """Return the belief after a frame's evidence, and the state for it."""
-    belief = belief.add(information.precision, information.shift)
-    gaussian = belief.gaussian()
+    belief, gaussian = belief.updated(information.precision, information.shift)
     nis = _normalised_innovation(information, gaussian, evidence)
-    belief = belief.sweep(gaussian)
     summary = _summary(belief, Convergence.SEARCH_CUT_OFF.unless(frame.converged))
     x = balance.polish(frame, belief.bounded(summary.b), evidence)
     return Update(**vars(summary), x=x, nis=nis)

@@ -7,7 +7,6 @@ matched like a level one.
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -15,7 +14,7 @@ from .config import RegistrationConfig
 from .lucas_kanade import Match, Normalised, Step, gradients, match, normalise, step_along, step_in_plane
 from .material_map import MaterialMap
 from .mesh_field import MeshField
-from .resampling import sample_doubled
+from .resampling import sample_doubled, sample_mask
 
 FINE_STEPS = 3
 """Steps with the fine window; the last one tells whether the registration has converged."""
@@ -155,13 +154,6 @@ def refine_disparity(
     quality = match(first, warp(last)[0], material, window=config.fine_window, config=config)
     spread = _white_noise(quality, windows[-1]) / np.maximum(step.information, MIN_DIVISOR)
     return Registered(value=last, match=quality, spread=spread, last_step=np.abs(last - value)[:, 0])
-
-
-def sample_mask(
-    mask: Bool[np.ndarray, "height width"], columns: Float[np.ndarray, "h w"], rows: Float[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
-    """Return a mask at given pixels, False outside the image."""
-    return cv2.remap(mask.astype(np.uint8), columns, rows, cv2.INTER_NEAREST, borderValue=0) > 0
 
 
 def _shorten(shift: Float[np.ndarray, "n k"], config: RegistrationConfig) -> Float[np.ndarray, "n k"]:

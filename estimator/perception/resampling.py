@@ -7,7 +7,7 @@ matches lock to whole pixels.
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 HALF_PIXEL = np.array([3, -25, 150, 150, -25, 3], np.float32) / 256
 """Lagrange interpolation through six samples, half-way between the middle two."""
@@ -36,3 +36,10 @@ def sample_doubled(
 ) -> Float[np.ndarray, "h w"]:
     """Return the original image at given pixels of its own grid, from its doubled version."""
     return cv2.remap(doubled, 2 * columns, 2 * rows, cv2.INTER_LINEAR)
+
+
+def sample_mask(
+    mask: Bool[np.ndarray, "height width"], columns: Float[np.ndarray, "h w"], rows: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return a mask at given pixels, False outside the image."""
+    return cv2.remap(mask.astype(np.uint8), columns, rows, cv2.INTER_NEAREST, borderValue=0) > 0

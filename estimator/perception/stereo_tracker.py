@@ -22,7 +22,8 @@ from .flow import dense_flow, flow_at
 from .material_map import MaterialMap
 from .mesh_field import MeshField
 from .rectified import RectifiedPair, Rectifier
-from .registration import FINE_STEPS, MaterialRegistration, Registered, refine_disparity, sample_mask
+from .registration import FINE_STEPS, MaterialRegistration, Registered, refine_disparity
+from .resampling import sample_mask
 from .sheet_mesh import DisparitySurface, lay_mesh
 from .tissue_mask import TissueMask, WarmTissue, largest_blob
 from .track import UNSEEN_VARIANCE, Track
