@@ -221,9 +221,7 @@ class AttachmentBelief(eqx.Module):
         """Run several sweeps."""
         return jax.lax.fori_loop(0, sweeps, lambda _, belief: belief.sweep(belief.gaussian()), self)
 
-    def updated(
-        self, precision: Float[Array, "n n"], shift: Float[Array, " n"]
-    ) -> tuple["AttachmentBelief", Gaussian]:
+    def updated(self, precision: Float[Array, "n n"], shift: Float[Array, " n"]) -> tuple["AttachmentBelief", Gaussian]:
         """Return the belief after a frame's evidence and one sweep, and the Gaussian over s before the sweep."""
         belief = self.add(precision, shift)
         gaussian = belief.gaussian()
