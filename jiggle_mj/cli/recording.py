@@ -145,6 +145,7 @@ def import_(
     out: Out,
     recording: Path | None = None,
     overwrite: bool = False,
+    allow_outside: bool = False,
     as_json: AsJson = False,
 ) -> None:
     """Convert a folder of measured points to a recording.
@@ -156,11 +157,14 @@ def import_(
         out: the recording to write; attachments that the TOML knows go to a separate truth file beside it.
         recording: the recording.toml; that of the folder if left out.
         overwrite: replace existing files.
+        allow_outside: read data files outside the folder where the TOML names them.
         as_json: print a summary to stdout as JSON.
     """
     from ..importing.folder import import_folder
 
-    summary = import_folder(folder, recording, out, overwrite=overwrite)
+    summary = import_folder(folder, recording, out, overwrite=overwrite, allow_outside=allow_outside)
+    for note in summary.notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     for name, why in summary.skipped:
         console.print(f"left out {name}: {why}")
     console.print(

@@ -18,6 +18,7 @@ from ..errors import RecordingError
 from ..observation import Declaration
 from ..recording.schemas import NS_PER_S
 from ..toml_kinds import StrictTable
+from .points.points_table import PointFiles, read_points_table
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Metres in one unit of the data files."""
@@ -25,25 +26,6 @@ MAX_ROTATION_ERROR = 1e-6
 """Largest entry of R R^T - 1 of a rotation: the rounding of six decimals."""
 DEFAULT_GRASP_RADIUS = 2e-3
 """Radius of the grip where none is given [m]; without effect where rows or vertices are declared held."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PointFiles:
-    """The files that hold the tracked points."""
-
-    files: tuple[str, ...]
-    """Names or patterns of the files, in the order of time; one .npz holds all frames."""
-    key: str | None = None
-    """Name of the positions in the .npz, shape (frames, points, 3); None for text files."""
-    times: str | None = None
-    """Name of the frames' times in the .npz, shape (frames,) [s]; None for frames at a constant period."""
-    runs: str | None = None
-    """Name of an array in the .npz, shape (frames,): integers that change where another grasp begins; None for one
-    grasp."""
-    columns: tuple[int, ...] = (0, 1, 2)
-    """Columns of x, y, z in a text file, from 0."""
-    rest: int = 0
-    """Number of the rest frame, from 0; it is written first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +154,7 @@ def _recording(top: StrictTable) -> MeasuredRecording:
         raise RecordingError(f"{top.where} unit must be one of {', '.join(UNITS)}; got '{unit}'.")
     mesh, grasp = top.table("mesh", optional=True), top.table("grasp")
     truth, extend = top.table("truth", optional=True), mesh.table("extend", optional=True)
-    points = _points(top.table("points"))
+    points = read_points_table(top.table("points"))
     faces = mesh.take("faces", kinds.text, "none")
     recording = MeasuredRecording(
         name=top.take("name", kinds.text),
@@ -200,29 +182,6 @@ def _recording(top: StrictTable) -> MeasuredRecording:
             f"{grasp.where} tool has times, so the frames need times on the same clock: give [points] times."
         )
     return recording
-
-
-def _points(table: StrictTable) -> PointFiles:
-    points = PointFiles(
-        files=table.take("files", kinds.texts),
-        key=table.take("key", kinds.text, None),
-        columns=tuple(table.take("columns", kinds.counts, (0, 1, 2))),
-        times=table.take("times", kinds.text, None),
-        runs=table.take("runs", kinds.text, None),
-        rest=table.take("rest", kinds.count, 0),
-    )
-    table.refuse_unknown()
-    if not points.files or len(points.columns) != 3:
-        raise RecordingError(f"{table.where} needs at least one file, and three columns for x, y, z.")
-    if (points.key is not None) != points.files[0].endswith(".npz"):
-        raise RecordingError(f"{table.where} key names the array of an .npz, and only that; files are {points.files}.")
-    if points.key is None and (points.times or points.runs):
-        raise RecordingError(f"{table.where} times and runs name arrays of an .npz; files are {points.files}.")
-    if points.times and points.rest:
-        raise RecordingError(f"{table.where} rest must be 0 where frames have times; got {points.rest}.")
-    if points.runs and not points.times:
-        raise RecordingError(f"{table.where} runs needs times.")
-    return points
 
 
 def _frame(table: StrictTable) -> WorldFrame:

@@ -23,8 +23,12 @@ from ..recording.truth import write_truth
 from ..recording.writer import RecordingWriter
 from ..sheet_triangulation import SheetPlane, extend, triangulate
 from ..truth import Truth
+from .data_folder import DataFolder
 from .declaration import Extension, MeasuredRecording, Rows, read_recording_toml
-from .point_files import read_faces, read_frames, read_npz, read_rows
+from .faces import read_faces
+from .point_files import read_frames, read_rows
+from .points.archives import read_array
+from .points.measured import PointFrames
 from .tool import Tool
 
 MAX_EDGE_SPACINGS = 2.5
@@ -55,6 +59,8 @@ class ImportSummary:
     """Number of attached vertices in the truth; None without truth."""
     skipped: tuple[tuple[str, str], ...]
     """Name and reason of each frame that was left out."""
+    notes: tuple[str, ...] = ()
+    """What the readers assumed or found, a line each."""
 
 
 def import_folder(
@@ -63,6 +69,7 @@ def import_folder(
     out: str | os.PathLike[str],
     *,
     overwrite: bool = False,
+    allow_outside: bool = False,
 ) -> ImportSummary:
     """Convert a folder of measured data to a recording, and a truth file where the TOML gives attachments.
 
@@ -71,6 +78,7 @@ def import_folder(
         recording_toml: their description; None for `recording.toml` in the folder.
         out: the recording to write; the truth goes beside it, as `truth_path` says.
         overwrite: replace existing files.
+        allow_outside: read data files outside the folder where the TOML names them.
 
     Raises:
         RecordingError: the TOML or a data file is missing or malformed, or the two contradict each other.
@@ -78,14 +86,16 @@ def import_folder(
         OutputError: an output exists, or cannot be written.
     """
     folder, out = Path(folder), Path(out)
+    data = DataFolder(path=folder, allow_outside=allow_outside)
     given = read_recording_toml(folder / "recording.toml" if recording_toml is None else Path(recording_toml))
-    frames, names, steps = _frames_in_world(folder, given)
+    found = read_frames(data, given.points)
+    frames, names, steps = _frames_in_world(found, given)
     rest = frames[0]
-    mesh = _declared_mesh(folder, given, rest)
-    clock = _clock(folder, given, len(frames))
-    tool = Tool.read(folder, given, rest, name=names[0], origin=clock.origin)
+    mesh = _declared_mesh(data, given, rest, found.notes)
+    clock = _clock(data, given, len(frames))
+    tool = Tool.read(data, given, rest, name=names[0], origin=clock.origin)
     name = identity(given.name, frames)
-    truth = _truth(folder, given, rest, mesh, name)
+    truth = _truth(data, given, rest, mesh, name)
     truth_file = truth_path(out)
     for path in (out, truth_file):
         if path.exists() and not overwrite:
@@ -128,12 +138,15 @@ def import_folder(
         n_held=n_held,
         n_attached=None if truth is None else int(truth.attached.sum()),
         skipped=tuple(skipped),
+        notes=tuple(found.notes),
     )
 
 
-def _frames_in_world(folder: Path, given: MeasuredRecording) -> tuple[Float[np.ndarray, "t n 3"], list[str], list[int]]:
+def _frames_in_world(
+    found: PointFrames, given: MeasuredRecording
+) -> tuple[Float[np.ndarray, "t n 3"], list[str], list[int]]:
     """Return the frames in the world [m], the rest frame first; their names; their number of frames after rest."""
-    frames, names = read_frames(folder, given.points)
+    frames, names = found.positions, found.names
     if given.points.rest >= len(frames):
         raise RecordingError(f"[points] rest is {given.points.rest}; there are {len(frames)} frames, counted from 0.")
     order = [given.points.rest, *(number for number in range(len(frames)) if number != given.points.rest)]
@@ -159,12 +172,12 @@ class _Clock:
     """Time of the first frame on the clock of the data [s]; 0 where the data have no times."""
 
 
-def _clock(folder: Path, given: MeasuredRecording, count: int) -> _Clock:
+def _clock(folder: DataFolder, given: MeasuredRecording, count: int) -> _Clock:
     points, seconds, numbers = given.points, np.arange(float(count)), np.zeros(count)
     if points.times is not None:
-        seconds = read_npz(folder / points.files[0], points.times)
+        seconds = read_array(folder / points.files[0], points.times)
     if points.runs is not None:
-        numbers = read_npz(folder / points.files[0], points.runs)
+        numbers = read_array(folder / points.files[0], points.runs)
     if seconds.shape != (count,) or numbers.shape != (count,) or not (np.diff(seconds) > 0).all():
         raise RecordingError(
             f"[points] times must increase and have one entry for each of the {count} frames, and so must runs; "
@@ -182,13 +195,14 @@ def _clock(folder: Path, given: MeasuredRecording, count: int) -> _Clock:
     )
 
 
-def _declared_mesh(folder: Path, given: MeasuredRecording, rest: Float[np.ndarray, "n 3"]) -> DeclaredMesh | None:
+def _declared_mesh(
+    folder: DataFolder, given: MeasuredRecording, rest: Float[np.ndarray, "n 3"], notes: list[str]
+) -> DeclaredMesh | None:
     if given.faces is None and given.extension is None:
         return None
     rows, faces = np.flatnonzero(np.isfinite(rest).all(axis=1)), None
     if given.faces is not None:
-        npz = folder / given.points.files[0] if given.points.key is not None else None
-        rows, faces = _seen_faces(rest, read_faces(folder, given.faces, npz=npz, first_vertex=given.first_vertex))
+        rows, faces = _seen_faces(rest, read_faces(folder, given, rest, notes))
     if given.extension is not None:
         return _extended(rest, rows, faces, given.extension)
     assert faces is not None
@@ -239,7 +253,7 @@ def _extended(
 
 
 def _truth(
-    folder: Path, given: MeasuredRecording, rest: Float[np.ndarray, "n 3"], mesh: DeclaredMesh | None, name: str
+    folder: DataFolder, given: MeasuredRecording, rest: Float[np.ndarray, "n 3"], mesh: DeclaredMesh | None, name: str
 ) -> Truth | None:
     """Return the presence of attachments; true positions are unknown, so the truth has no frames."""
     if given.attached is None:

@@ -1,7 +1,6 @@
-"""Reading tracked points, rows and triangles from the text files and .npz archives of measured data.
+"""Reading tracked points, rows and triangles from the files of measured data.
 
-Text: numbers in columns, separated by blanks, commas or semicolons; lines that begin with # or % are comments, and one
-heading line is skipped. Row i is the same material point in every frame. Applies no units: see `folder`.
+Row i is the same material point in every frame. Applies no units: see `folder`.
 """
 
 from pathlib import Path
@@ -10,45 +9,69 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import RecordingError
-from .declaration import PointFiles, Rows
+from .data_folder import DataFolder, quoted
+from .declaration import Rows
+from .points.array_frames import read_array_frames
+from .points.file_kinds import FileKind, file_kind
+from .points.frame_order import frame_files
+from .points.measured import Measured, PointFrames, displaced, in_space
+from .points.mesh_frames import read_mesh_frames
+from .points.points_table import PointFiles
+from .points.text_frames import missing_rule, read_text_frames
+from .points.text_lines import read_text
+from .points.unseen import MarkCheck
 
 
-def read_frames(folder: Path, points: PointFiles) -> tuple[Float[np.ndarray, "t n 3"], list[str]]:
-    """Return all frames in the order of time, in the unit of the data, and a name for each.
-
-    Raises:
-        RecordingError: a file is missing or malformed, or the frames differ in their number of points.
-    """
-    if points.key is not None:
-        path = folder / points.files[0]
-        frames = read_npz(path, points.key)
-        if frames.ndim != 3 or frames.shape[2] != 3:
-            raise RecordingError(f"{path}: {points.key} must have shape (frames, points, 3); it has {frames.shape}.")
-        return frames.astype(float), [f"{path.name} frame {number}" for number in range(len(frames))]
-    paths = [path for pattern in points.files for path in _matching(folder, pattern)]
-    tables = [_columns(path, points.columns) for path in paths]
-    for path, table in zip(paths, tables, strict=True):
-        if len(table) != len(tables[0]):
-            raise RecordingError(
-                f"the frames differ in their number of points: {paths[0].name} has {len(tables[0])} rows, "
-                f"{path.name} has {len(table)}; row i must be the same point in every file."
-            )
-    return np.stack(tables), [path.name for path in paths]
-
-
-def read_faces(folder: Path, faces: str, *, npz: Path | None, first_vertex: int) -> Int[np.ndarray, "f 3"]:
-    """Return triangles from an array of the points' .npz, or from a text file, with vertices counted from 0.
+def read_frames(folder: DataFolder, points: PointFiles) -> PointFrames:
+    """Return all frames in the order of time.
 
     Raises:
-        RecordingError: the array or file is missing or malformed.
+        RecordingError: a file is missing, malformed, outside the folder or too large, the frames differ in their number
+            of points, or coordinates stand for lost points without a rule that says so.
     """
-    table = read_npz(npz, faces) if npz is not None else _columns(folder / faces, (0, 1, 2))
-    if table.ndim != 2 or table.shape[1] != 3 or not np.array_equal(table, np.round(table)):
-        raise RecordingError(f"faces '{faces}' must be three whole numbers a row; got shape {table.shape}.")
-    return table.astype(np.int64) - first_vertex
+    paths, notes = frame_files(folder, points.files)
+    kinds = {file_kind(path): path for path in reversed(paths)}
+    kind = file_kind(paths[0])
+    if len(kinds) > 1:
+        other = next(path for each, path in kinds.items() if each != kind)
+        raise RecordingError(f"{paths[0].name} and {other.name} are files of different kinds; frames need one kind.")
+    measured = _read(paths, kind, points)
+    positions = in_space(displaced(measured))
+    if measured.positions.shape[2] == 2:
+        notes.append("points have two coordinates: they lie in the plane z = 0")
+    positions = _without_unseen(positions, measured, points)
+    return PointFrames(positions=positions, names=measured.names, notes=[*notes, *measured.notes])
 
 
-def read_rows(folder: Path, rows: Rows, n_points: int, where: str) -> Int[np.ndarray, " r"]:
+def _read(paths: list[Path], kind: FileKind, points: PointFiles) -> Measured:
+    if kind == "text":
+        return read_text_frames(paths, points)
+    if kind in ("ply", "obj", "pcd"):
+        return read_mesh_frames(paths, kind, points)
+    return read_array_frames(paths, points)
+
+
+def _without_unseen(
+    positions: Float[np.ndarray, "t n 3"], measured: Measured, points: PointFiles
+) -> Float[np.ndarray, "t n 3"]:
+    """Return positions with NaN where a rule or an array says that a point was not seen."""
+    unseen = np.zeros(positions.shape[:2], bool)
+    rule = missing_rule(points)
+    if rule is not None:
+        reference = in_space(measured.positions)
+        unseen |= rule.unseen_by_place(positions) | rule.unseen_by_place(reference)
+        if measured.rule_values is not None:
+            unseen |= rule.unseen_by_value(measured.rule_values)
+    if measured.seen is not None:
+        unseen |= ~measured.seen
+    positions = np.where(unseen[:, :, np.newaxis], np.nan, positions)
+    accepted = points.missing is not None and points.missing.place is None and points.missing.column is None
+    if not accepted:
+        MarkCheck(names=measured.names, headings=measured.headings).refuse_marks(positions)
+    return positions
+
+
+def read_rows(folder: DataFolder, rows: Rows, n_points: int, where: str) -> Int[np.ndarray, " r"]:
     """Return row numbers, counted from 0.
 
     Raises:
@@ -57,65 +80,17 @@ def read_rows(folder: Path, rows: Rows, n_points: int, where: str) -> Int[np.nda
     numbers: list[int] = list(rows.rows)
     if rows.file is not None:
         path = folder / rows.file
-        try:
-            numbers = [int(word) for word in _read_text(path).replace(",", " ").split()]
-        except ValueError as failure:
-            raise RecordingError(f"{path} must hold whole numbers ({failure}).") from failure
+        if file_kind(path) != "text":
+            raise RecordingError(f"{path} must be text that holds row numbers.")
+        words = read_text(path).replace(",", " ").replace(";", " ").split()
+        wrong_word = next((word for word in words if not word.isdecimal() or len(word) > 9), None)
+        if wrong_word is not None:
+            raise RecordingError(f"{path} must hold whole numbers; it holds '{quoted(wrong_word)}'.")
+        numbers = [int(word) for word in words]
     wrong = [number for number in numbers if not 0 <= number - rows.first < n_points]
     if wrong or not numbers:
         raise RecordingError(
-            f"{where} names row {wrong[0] if wrong else 'none'}; rows are numbered "
+            f"{where} names row {quoted(wrong[0]) if wrong else 'none'}; rows are numbered "
             f"{rows.first}..{rows.first + n_points - 1} (the first row is {rows.first})."
         )
     return np.unique(np.array(numbers) - rows.first)
-
-
-def read_npz(path: Path, key: str) -> np.ndarray:
-    """Return one array of an archive.
-
-    Raises:
-        RecordingError: the file is missing or no archive, or has no such array.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if key not in archive.files:
-                raise RecordingError(f"{path} has no array '{key}'; it has {', '.join(archive.files)}.")
-            return archive[key]
-    except (OSError, ValueError, EOFError, AttributeError) as failure:
-        raise RecordingError(f"{path} cannot be read as .npz: {failure}.") from failure
-
-
-def _matching(folder: Path, pattern: str) -> list[Path]:
-    if not any(mark in pattern for mark in "*?["):
-        return [folder / pattern]
-    paths = sorted(folder.glob(pattern))
-    if not paths:
-        raise RecordingError(f"{folder} holds no file that matches '{pattern}'.")
-    return paths
-
-
-def _columns(path: Path, columns: tuple[int, ...]) -> Float[np.ndarray, "n c"]:
-    table: list[list[float]] = []
-    for number, line in enumerate(_read_text(path).splitlines(), start=1):
-        words = line.replace(",", " ").replace(";", " ").split()
-        if not words or words[0][0] in "#%":
-            continue
-        if len(words) <= max(columns):
-            raise RecordingError(
-                f"{path} line {number} has {len(words)} columns; columns {list(columns)} (from 0) are needed."
-            )
-        try:
-            table.append([float(words[column]) for column in columns])
-        except ValueError as failure:
-            if table or number > 1:
-                raise RecordingError(f"{path} line {number} holds text that is not a number ({failure}).") from failure
-    if not table:
-        raise RecordingError(f"{path} holds no rows of numbers.")
-    return np.array(table)
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError) as failure:
-        raise RecordingError(f"{path} cannot be read as text: {failure}.") from failure

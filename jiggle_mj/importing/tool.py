@@ -4,7 +4,6 @@ Between two reports the position is interpolated linearly; nothing else is fille
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,8 +12,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..errors import RecordingError
 from ..observation import IDENTITY_WXYZ, ToolReport, ToolState
 from ..recording.schemas import NS_PER_S
+from .data_folder import DataFolder
 from .declaration import GraspPath, MeasuredRecording, ReportedTool, Rows
-from .point_files import read_npz, read_rows
+from .point_files import read_rows
+from .points.archives import read_array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +61,7 @@ class Tool:
 
     @classmethod
     def read(
-        cls, folder: Path, given: MeasuredRecording, rest: Float[np.ndarray, "n 3"], *, name: str, origin: float
+        cls, folder: DataFolder, given: MeasuredRecording, rest: Float[np.ndarray, "n 3"], *, name: str, origin: float
     ) -> "Tool":
         """Read the tool from the data files.
 
@@ -123,9 +124,9 @@ class Tool:
         )
 
 
-def _reports(folder: Path, given: MeasuredRecording, grasp: ReportedTool, origin: float) -> Reports:
+def _reports(folder: DataFolder, given: MeasuredRecording, grasp: ReportedTool, origin: float) -> Reports:
     archive, frame = folder / given.points.files[0], given.frame
-    seconds, positions = read_npz(archive, grasp.times), read_npz(archive, grasp.tool)
+    seconds, positions = read_array(archive, grasp.times), read_array(archive, grasp.tool)
     count = len(seconds)
     if positions.shape != (count, 3) or count < 2 or not (np.diff(seconds) > 0).all():
         raise RecordingError(
@@ -134,7 +135,7 @@ def _reports(folder: Path, given: MeasuredRecording, grasp: ReportedTool, origin
         )
     quaternions = np.tile(IDENTITY_WXYZ, (count, 1))
     if grasp.orientations is not None:
-        quaternions = read_npz(archive, grasp.orientations)
+        quaternions = read_array(archive, grasp.orientations)
     if quaternions.shape != (count, 4):
         raise RecordingError(
             f"{archive}: {grasp.orientations} must have shape ({count}, 4), w first; it has {quaternions.shape}."

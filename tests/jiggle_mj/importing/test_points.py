@@ -98,7 +98,8 @@ def test_csv_with_a_heading_and_other_columns_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("1 2 3\n4 5\n", r"line 2 has 2 columns; columns \[0, 1, 2\]"),
+        ("1 2 3\n4 5\n", "line 2 has 2 columns, line 1 has 3: all rows must have as many"),
+        ("1\n2\n", r"line 1 has 1 columns; columns \[0, 1, 2\]"),
         ("1 2 3\n4 5 six\n", "line 2 holds text that is not a number"),
         ("x y z\n", "holds no rows of numbers"),
         ("1 2 3\n", "rest.xyz has 12 rows, pulled_1.xyz has 1"),

@@ -1,0 +1,196 @@
+"""Arrays in .npz, .npy and .mat files: plain numbers alone, of a size that is checked before they are read.
+
+Nothing is unpickled: a pickle can run code.
+"""
+
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedIOBase
+from lzma import LZMAError
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+from numpy.lib import format as npy_format
+from scipy.io import loadmat, whosmat
+from scipy.io.matlab import MatReadError
+
+from ...errors import RecordingError
+from ..data_folder import quoted
+from .file_kinds import MAX_POSITION_BYTES, file_kind
+
+DAMAGE = (
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    EOFError,
+    ArithmeticError,
+    MemoryError,
+    RuntimeError,
+    NotImplementedError,
+    SyntaxError,
+    AttributeError,
+    AssertionError,
+    struct.error,
+    zlib.error,
+    LZMAError,
+    zipfile.BadZipFile,
+    MatReadError,
+    Warning,
+)
+"""What the readers of numpy, scipy, trimesh and the standard library raise on damaged bytes."""
+NUMBER_KINDS = "biuf"
+"""Kinds of arrays that hold plain numbers: bool, int, unsigned, float."""
+HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
+"""Readers of the headers of plain arrays, by the format's version."""
+MAT_HEADER_BYTES, MAT_COMPRESSED, INFLATE_STEP = 128, 15, 2**20
+"""Length of a .mat's header, type of a compressed element, and how much of it is inflated at once [bytes]."""
+MAX_LISTED = 12
+"""How many arrays an error lists."""
+
+
+@contextmanager
+def damage_refused(path: Path, kind: str) -> Iterator[None]:
+    """Turn what a library raises on damaged bytes into a RecordingError."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            yield
+    except DAMAGE as failure:
+        why = quoted(failure) or type(failure).__name__
+        raise RecordingError(f"{path} cannot be read as {kind}: {why}.") from failure
+
+
+def read_array(path: Path, key: str | None) -> Shaped[np.ndarray, "..."]:
+    """Return one array of numbers of an .npz or .mat, or that of an .npy, as it is stored.
+
+    Args:
+        path: the file.
+        key: name of the array; None for an .npy, which holds one.
+
+    Raises:
+        RecordingError: the file is missing, damaged or no archive, has no such array, or the array is too large or
+            holds no plain numbers.
+    """
+    kind = file_kind(path)
+    if kind not in ("npz", "npy", "mat"):
+        raise RecordingError(f"{path} cannot be read as .npz, .npy or .mat: it is none.")
+    with damage_refused(path, f".{kind}"):
+        if kind == "npy":
+            return _read_npy(path)
+        shapes = _npz_shapes(path) if kind == "npz" else _mat_shapes(path)
+        if key not in shapes:
+            what = (
+                "needs [points] key, the name of one of its arrays" if key is None else f"has no array '{quoted(key)}'"
+            )
+            raise RecordingError(f"{path} {what}; it has {describe(shapes)}.")
+        array = _read_npz(path, key) if kind == "npz" else loadmat(path, variable_names=[key])[key]
+    if array.dtype.kind not in NUMBER_KINDS:
+        raise RecordingError(f"{path}: {key} holds {array.dtype}, not plain numbers.")
+    return array
+
+
+def array_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Return name and shape of each array of numbers in an .npz or .mat, without reading the arrays.
+
+    Raises:
+        RecordingError: the file is missing, damaged or no archive.
+    """
+    kind = file_kind(path)
+    if kind not in ("npz", "mat"):
+        return {}
+    with damage_refused(path, f".{kind}"):
+        return _npz_shapes(path) if kind == "npz" else _mat_shapes(path)
+
+
+def describe(shapes: dict[str, tuple[int, ...]]) -> str:
+    """Return names and shapes for an error."""
+    listed = [f"{quoted(name)} {shape}" for name, shape in list(shapes.items())[:MAX_LISTED]]
+    return ", ".join([*listed, "..."] if len(shapes) > MAX_LISTED else listed) or "none of numbers"
+
+
+def _npz_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    shapes = {}
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            if info.filename.endswith(".npy"):
+                with archive.open(info) as stream:
+                    header = _header(stream)
+                if header is not None:
+                    shapes[info.filename.removesuffix(".npy")] = header[0]
+    return shapes
+
+
+def _read_npz(path: Path, key: str) -> Shaped[np.ndarray, "..."]:
+    with zipfile.ZipFile(path) as archive:
+        info = archive.getinfo(f"{key}.npy")
+        with archive.open(info) as stream:
+            _refuse_large(path, key, stream, info.file_size)
+        with archive.open(info) as stream:
+            return npy_format.read_array(stream, allow_pickle=False)
+
+
+def _read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
+    with path.open("rb") as stream:
+        _refuse_large(path, "the array", stream, path.stat().st_size)
+        stream.seek(0)
+        return npy_format.read_array(stream, allow_pickle=False)
+
+
+def _refuse_large(path: Path, name: str, stream: BufferedIOBase, n_bytes: int) -> None:
+    """Refuse an array whose header declares no plain numbers, too many, or another number than the file holds."""
+    header = _header(stream)
+    if header is None:
+        raise RecordingError(f"{path}: {name} holds no plain numbers; objects are never read.")
+    shape, dtype = header
+    declared = 8  # bytes of a number once it is read
+    for length in shape:
+        declared *= length
+    if declared > MAX_POSITION_BYTES:
+        raise RecordingError(
+            f"{path}: {name} has shape {quoted(shape)}, {declared} bytes; at most {MAX_POSITION_BYTES} are read: split "
+            "the recording, or keep fewer points or frames."
+        )
+    if declared // 8 * dtype.itemsize > n_bytes:
+        raise RecordingError(f"{path}: {name} has shape {shape}, but the file ends before that.")
+
+
+def _header(stream: BufferedIOBase) -> tuple[tuple[int, ...], np.dtype] | None:
+    """Return shape and type of the array in a stream; None where it holds no plain numbers."""
+    try:
+        reader = HEADERS.get(npy_format.read_magic(stream))
+        if reader is None:
+            return None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a header of Python 2, which is read as well
+            shape, _, dtype = reader(stream)
+    except ValueError:
+        return None
+    return (shape, dtype) if dtype.kind in NUMBER_KINDS and all(length >= 0 for length in shape) else None
+
+
+def _mat_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    _refuse_inflated(path)
+    numeric = {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+    return {name: tuple(shape) for name, shape, kind in whosmat(path) if kind in numeric}
+
+
+def _refuse_inflated(path: Path) -> None:
+    """Refuse a .mat whose compressed elements hold more than the positions of a recording may."""
+    data = path.read_bytes()
+    order = ">" if data[126:128] == b"MI" else "<"
+    place, total = MAT_HEADER_BYTES, 0
+    while place + 8 <= len(data):
+        kind, length = struct.unpack(f"{order}II", data[place : place + 8])
+        rest, inflater = data[place + 8 : place + 8 + length], zlib.decompressobj()
+        place += 8 + length
+        while kind == MAT_COMPRESSED and rest:
+            total += len(inflater.decompress(rest, INFLATE_STEP))
+            rest = inflater.unconsumed_tail
+            if total > MAX_POSITION_BYTES:
+                raise RecordingError(f"{path} holds more than {MAX_POSITION_BYTES} bytes once unpacked: split it.")

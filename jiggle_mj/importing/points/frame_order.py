@@ -1,0 +1,59 @@
+"""Order in time of the files of frames: by the numbers in their names, 2 before 10."""
+
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from ...errors import RecordingError
+from ..data_folder import DataFolder, quoted
+
+DIGITS = re.compile(r"(\d+)")
+"""A number in a name."""
+FRACTION = re.compile(r"\d+\.\d+")
+"""A number with a decimal point in a name, as a time has."""
+
+
+def frame_files(folder: DataFolder, patterns: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """Return the files in the order of time, and notes where that is not the order of their names.
+
+    Names and patterns keep their order; the files of one pattern are ordered by the numbers in their names.
+
+    Raises:
+        RecordingError: a file is outside the folder or named twice, nothing matches, or the numbers give no order.
+    """
+    paths: list[Path] = []
+    notes: list[str] = []
+    for pattern in patterns:
+        found = sorted(folder.matching(pattern))
+        natural = sorted(found, key=lambda path: (_natural(_stem(path)), path.name))
+        _refuse_unequal_fractions(natural, pattern)
+        if natural != found:
+            before, after = next((a, b) for a, b in pairwise(natural) if found.index(a) > found.index(b))
+            notes.append(f"frames are in the order of their numbers: {before.name} before {after.name}")
+        paths += natural
+    twice = next((path for path in paths if paths.count(path) > 1), None) if len(set(paths)) < len(paths) else None
+    if twice is not None:
+        raise RecordingError(f"[points] files names {twice.name} twice; each file is one frame.")
+    return paths, notes
+
+
+def _stem(path: Path) -> str:
+    """Return the path without its suffix, whose digits are no frame number."""
+    return str(path.with_suffix("")) if path.suffix else str(path)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Return a key that compares numbers by value; text and numbers alternate, so that like compares with like."""
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in DIGITS.split(name)]
+
+
+def _refuse_unequal_fractions(paths: list[Path], pattern: str) -> None:
+    """Refuse decimal numbers of several lengths: 1.10 comes after 1.9 as a version, before it as a time."""
+    numbers = [match.group() for path in paths for match in FRACTION.finditer(path.stem)]
+    lengths = {len(number.partition(".")[2]) for number in numbers}
+    if len(lengths) > 1:
+        raise RecordingError(
+            f"the files of '{quoted(pattern)}' have decimal numbers of several lengths in their names, which give no "
+            "clear order: list them in [points] files."
+        )

@@ -1,0 +1,141 @@
+"""Frames of tracked points in text tables, one file a frame."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ...errors import RecordingError
+from ..data_folder import quoted
+from .dic_formats import DIC_FORMATS, DISPLACEMENT_HEADINGS
+from .file_kinds import refuse_many
+from .measured import Measured
+from .missing_rule import MissingRule
+from .points_table import PointFiles
+from .text_format import TextFormat, plain_heading
+from .text_lines import read_lines
+from .text_table import TextTable
+
+Column = int | str
+AXES = ("x", "y", "z")
+"""Headings of positions, where the user names no columns."""
+
+
+def read_text_frames(paths: list[Path], points: PointFiles) -> Measured:
+    """Return the contents of text files, which all have the format and the columns of the first.
+
+    Raises:
+        RecordingError: a file is no table, lacks a column, or the files differ in their number of rows.
+    """
+    first = _open(paths[0], points, None)
+    columns, notes = _position_columns(first, points)
+    displacements = _displacement_columns(first, points)
+    rule = missing_rule(points)
+    rule_column = _rule_column(first, rule, columns, by_format=points.missing is None)
+    wanted = [*columns, *displacements, *([] if rule_column is None else [rule_column])]
+    refuse_many(len(paths), len(first.text.lines) - first.sample.first)
+    frames = [_read(path, points, first, wanted, number) for number, path in enumerate(paths)]
+    for path, frame in zip(paths, frames, strict=True):
+        if len(frame) != len(frames[0]):
+            raise RecordingError(
+                f"the frames differ in their number of points: {paths[0].name} has {len(frames[0])} rows, {path.name} "
+                f"has {len(frame)}; row i must be the same point in every file, empty or nan where it is lost."
+            )
+    values = np.stack(frames)
+    n = len(columns)
+    if points.columns is None and points.format is None:
+        _refuse_row_numbers(values[0, :, 0], first)
+    return Measured(
+        positions=values[:, :, :n],
+        displacements=values[:, :, n : 2 * n] if displacements else None,
+        by_format=points.format is not None,
+        rule_values=None if rule_column is None else values[:, :, -1],
+        unused_displacements=() if displacements else _unused_displacements(first, columns),
+        headings=tuple(first.sample.names),
+        names=[path.name for path in paths],
+        notes=notes,
+    )
+
+
+def missing_rule(points: PointFiles) -> MissingRule | None:
+    """Return the rule that the user gives, or that of the format."""
+    if points.missing is None and points.format is not None:
+        return DIC_FORMATS[points.format].missing
+    return points.missing
+
+
+def _open(path: Path, points: PointFiles, known: TextFormat | None) -> TextTable:
+    columns = DIC_FORMATS[points.format].columns if points.format is not None else points.columns
+    return TextTable.open(read_lines(path), columns=columns, given=(points.separator, points.decimal), known=known)
+
+
+def _read(
+    path: Path, points: PointFiles, first: TextTable, wanted: list[Column], number: int
+) -> Float[np.ndarray, "n c"]:
+    """Return the wanted columns of one file; a heading must be that of the first file."""
+    table = first if number == 0 else _open(path, points, first.sample.format)
+    if table.sample.names != first.sample.names:
+        raise RecordingError(
+            f"{path} has the heading '{quoted(', '.join(table.sample.names)) or 'none'}', {first.text.path.name} has "
+            f"'{quoted(', '.join(first.sample.names)) or 'none'}': the columns of all frames must be the same."
+        )
+    return table.read(wanted)
+
+
+def _position_columns(table: TextTable, points: PointFiles) -> tuple[list[Column], list[str]]:
+    """Return the columns of x, y and z, and notes where the heading decided it."""
+    if points.format is not None:
+        return list(DIC_FORMATS[points.format].columns), []
+    if points.columns is not None:
+        return list(points.columns), []
+    plain = [plain_heading(name) for name in table.sample.names]
+    if all(plain.count(axis) == 1 for axis in AXES):
+        columns: list[Column] = [plain.index(axis) for axis in AXES]
+        return columns, [] if columns == [0, 1, 2] else [f"x, y and z are columns {columns}, by the heading"]
+    for name, known in DIC_FORMATS.items():
+        if {plain_heading(column) for column in known.columns} <= set(plain):
+            raise RecordingError(f'{table.text.path} has the headings of a DIC export: give format = "{name}".')
+    return [0, 1, 2], []
+
+
+def _displacement_columns(table: TextTable, points: PointFiles) -> list[Column]:
+    if points.format is None:
+        return list(points.displacements or ())
+    plain = {plain_heading(name) for name in table.sample.names}
+    columns = DIC_FORMATS[points.format].displacements
+    return list(columns) if {plain_heading(column) for column in columns} <= plain else []
+
+
+def _rule_column(
+    table: TextTable, rule: MissingRule | None, columns: list[Column], *, by_format: bool
+) -> Column | None:
+    """Return the column of the rule: a number, a heading, or x, y or z; None for none."""
+    if rule is None or rule.column is None:
+        return None
+    plain = [plain_heading(name) for name in table.sample.names]
+    if plain_heading(rule.column) in plain:
+        return rule.column
+    if by_format:
+        return None
+    if rule.column in AXES[: len(columns)]:
+        return columns[AXES.index(rule.column)]
+    return int(rule.column) if rule.column.isdecimal() and rule.column.isascii() else rule.column
+
+
+def _unused_displacements(table: TextTable, columns: list[Column]) -> tuple[str, ...]:
+    plain = [plain_heading(name) for name in table.sample.names]
+    for headings in DISPLACEMENT_HEADINGS:
+        wanted = [plain_heading(heading) for heading in headings[: len(columns)]]
+        if all(plain.count(name) == 1 for name in wanted):
+            return tuple(table.sample.names[plain.index(name)] for name in wanted)
+    return ()
+
+
+def _refuse_row_numbers(first_column: Float[np.ndarray, " n"], table: TextTable) -> None:
+    """Refuse a first column that counts the rows, where there are more than three and the user named none."""
+    count = np.arange(len(first_column))
+    if table.width > 3 and len(count) > 2 and np.array_equal(first_column - first_column[0], count):
+        raise RecordingError(
+            f"{table.text.path}: the first of {table.width} columns counts the rows, and would be x: give columns = "
+            "[1, 2, 3] in [points], or those of x, y and z."
+        )

@@ -1,0 +1,136 @@
+"""Which tracked points are unseen: by a visibility array, by the rule `missing`, and marks that nobody declared."""
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from ...errors import RecordingError
+from ..data_folder import quoted
+
+VISIBILITY_NAME = re.compile(r"vis|occlu|valid|lost", re.IGNORECASE)
+"""Names that trackers give to arrays of which points are seen."""
+NEGATED = re.compile(r"not\s+(.+)")
+"""A visibility that is the opposite of an array."""
+MARK_VALUES = (0.0, 1.0, -1.0, -9.0, -99.0, -999.0, -9999.0, -99999.0, 999.0, 9999.0, 99999.0)
+"""Coordinates that programs write for a point without any."""
+MAX_COORDINATE = 1e9
+"""Size above which a coordinate is a mark, whatever the unit: a thousand kilometres in mm."""
+MAX_LISTED_ROWS = 5
+"""How many rows an error lists."""
+
+
+def read_visibility(
+    array: Shaped[np.ndarray, "..."], *, name: str, shape: tuple[int, int], swapped: bool, threshold: float
+) -> tuple[Bool[np.ndarray, "t n"], str]:
+    """Return which points are seen, and in words how that was read.
+
+    Args:
+        array: True, 1 or a probability where a point is seen; shape (frames, points) or (points, frames), with a batch
+            of one before and an axis of length 1 behind allowed.
+        name: file and array, for errors.
+        shape: number of frames and of points.
+        swapped: whether the positions have their points first; decides where both orders fit.
+        threshold: probability from which a point is seen.
+
+    Raises:
+        RecordingError: the array has another shape, or holds neither truth values nor probabilities.
+    """
+    flat = array
+    while flat.ndim > 2 and 1 in (flat.shape[0], flat.shape[-1]):
+        flat = flat[..., 0] if flat.shape[-1] == 1 else flat[0]
+    fits = {flat.shape == shape: flat, flat.shape == shape[::-1]: flat.T}
+    if flat.ndim != 2 or True not in fits:
+        raise RecordingError(
+            f"{name} has shape {array.shape}; visibility needs one value for each of {shape[0]} frames and {shape[1]} "
+            "points."
+        )
+    values = flat.T if swapped and flat.shape == shape[::-1] else fits[True] if shape[0] != shape[1] else flat
+    values = np.asarray(values)
+    if values.dtype.kind == "b":
+        return values, "true is seen"
+    if not ((values >= 0) & (values <= 1)).all():
+        raise RecordingError(
+            f"{name} holds values from {np.nanmin(values):.3g} to {np.nanmax(values):.3g}; visibility is true or "
+            'false, or a probability; for other values give missing = "ARRAY < NUMBER".'
+        )
+    if set(np.unique(values)) <= {0, 1}:
+        return values == 1, "1 is seen"
+    return values >= threshold, f"a probability of {threshold:g} or more is seen"
+
+
+def split_negation(name: str) -> tuple[str, bool]:
+    """Return the array that a visibility names, and whether it says which points are not seen."""
+    negated = NEGATED.fullmatch(name)
+    return (negated[1], True) if negated else (name, False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkCheck:
+    """Search for coordinates that stand for a lost point though nobody says so."""
+
+    names: list[str]
+    """Name of each frame, for errors."""
+    headings: tuple[str, ...] = field(default=())
+    """Columns or arrays beside the positions, offered in the error."""
+
+    def refuse_marks(self, positions: Float[np.ndarray, "t n 3"]) -> None:
+        """Refuse positions that cannot be those of points.
+
+        Two points cannot be at one place; a point that is at 0, 0, 0 or another usual mark in some frames alone has
+        not moved there; no sheet is a million metres away.
+
+        Raises:
+            RecordingError: such a position is there; names frame, rows and place.
+        """
+        for number, frame in enumerate(positions):
+            large = np.flatnonzero((np.abs(np.nan_to_num(frame)) > MAX_COORDINATE).any(axis=1))
+            if len(large):
+                self._refuse(number, frame[large[0]], large, "too far away for a point")
+            rows = _shared_place(frame)
+            if len(rows):
+                self._refuse(number, frame[rows[0]], rows, "two points cannot be at one place")
+        marked = np.isin(positions, MARK_VALUES).all(axis=2)
+        partly = marked & ~marked.all(axis=0)
+        jumped = partly & (_jump(positions) > _extent(positions))
+        at_origin = partly & (positions == 0).all(axis=2) & ~marked[0]
+        frames, points = np.nonzero(jumped | at_origin)
+        if len(frames):
+            rows = points[frames == frames[0]]
+            self._refuse(int(frames[0]), positions[frames[0], rows[0]], rows, "it is elsewhere in other frames")
+
+    def _refuse(self, number: int, place: Float[np.ndarray, " 3"], rows: Int[np.ndarray, " r"], why: str) -> None:
+        listed = ", ".join(str(row) for row in rows[:MAX_LISTED_ROWS]) + (
+            ", ..." if len(rows) > MAX_LISTED_ROWS else ""
+        )
+        x, y, z = (f"{value:.9g}" for value in place)
+        others = f" (the file has {quoted(', '.join(self.headings))})" if self.headings else ""
+        raise RecordingError(
+            f"{self.names[number]} has {len(rows)} point{'s' * (len(rows) > 1)} at exactly ({x}, {y}, {z}), rows "
+            f"{listed} from 0: {why}. If that marks lost points, give missing = [{x}, {y}, {z}] in [points], or a "
+            f'rule as "COLUMN == -1"{others}; if it is right, missing = "none".'
+        )
+
+
+def _shared_place(frame: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " r"]:
+    """Return the rows at the place that most points of a frame share exactly; none where no two do."""
+    rows = np.flatnonzero(np.isfinite(frame).all(axis=1))
+    if len(rows) < 2:
+        return np.empty(0, np.int64)
+    _, which, counts = np.unique(frame[rows], axis=0, return_inverse=True, return_counts=True)
+    return rows[which.ravel() == counts.argmax()] if counts.max() > 1 else np.empty(0, np.int64)
+
+
+def _jump(positions: Float[np.ndarray, "t n 3"]) -> Float[np.ndarray, "t n"]:
+    """Return the distance of each position from the median of its point's positions."""
+    seen = np.isfinite(positions).all(axis=(0, 2))
+    jump = np.zeros(positions.shape[:2])
+    jump[:, seen] = np.linalg.norm(positions[:, seen] - np.median(positions[:, seen], axis=0), axis=2)
+    return jump
+
+
+def _extent(positions: Float[np.ndarray, "t n 3"]) -> float:
+    """Return half the diagonal of the first frame's bounding box."""
+    finite = positions[0][np.isfinite(positions[0]).all(axis=1)]
+    return 0.5 * float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 0.0
