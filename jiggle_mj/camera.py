@@ -16,6 +16,8 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Transform from an OpenGL camera frame (y up, looking along -z; MuJoCo's) to an optical one; it is its own inverse."""
 QUATERNION_DECIMALS = 12
 """Decimals of a recorded quaternion: few enough that a rotation that is read is recorded as the same digits again."""
+MAX_BASELINE_M = 1.0
+"""Largest baseline [m]: a stereo endoscope has 4 mm, a stereo head over a table 0.3 m."""
 EQUAL_INTRINSICS = 1e-6
 """Largest relative and absolute [px] difference of equal rectified intrinsics: a calibration file rounds its digits."""
 
@@ -74,7 +76,8 @@ class StereoCamera:
     """Two calibrated cameras and the pose of the left one.
 
     Raises:
-        RecordingError: sizes or rectified intrinsics differ, or the right camera's P[0, 3] is not negative (swapped?).
+        RecordingError: sizes or rectified intrinsics differ, or the right camera's P[0, 3] is not negative (swapped?),
+            or the baseline is beyond `MAX_BASELINE_M`.
     """
 
     left: CameraCalibration
@@ -95,6 +98,11 @@ class StereoCamera:
             raise RecordingError(
                 f"right camera_info has P[0,3] = {self.right.P[0, 3]:.6g}; it must be -fx*baseline, below zero "
                 "(are the cameras swapped, or is the calibration monocular?)."
+            )
+        if self.baseline > MAX_BASELINE_M:
+            raise RecordingError(
+                f"the baseline is {self.baseline:.4g} m (right camera_info P[0,3] = {self.right.P[0, 3]:.6g}); at most "
+                f"{MAX_BASELINE_M:g} m are read (is it in millimetres? then it is {self.baseline / 1e3:.4g} m)."
             )
         if self.left.P[0, 3] != 0 or not np.allclose(
             self.left.P[:, :3], self.right.P[:, :3], rtol=EQUAL_INTRINSICS, atol=EQUAL_INTRINSICS

@@ -4,6 +4,7 @@
 records the estimate. A recording is another source of observations. Scoring is in `jiggle_mj.eval`.
 """
 
+import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
@@ -18,6 +19,7 @@ from .observation import Observation
 from .recording.declaration import identity
 from .recording.estimate import EstimateWriter
 from .recording.mcap_files import truth_path
+from .recording.output_files import discard, partial_path
 from .recording.reader import Recording
 from .recording.truth import TruthWriter
 from .recording.writer import RecordingWriter
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 
 RECORDING, ESTIMATE, RESULT, REPORT = "run.mcap", "estimate.mcap", "result.json", "report.html"
 """Files in the output folder of a run."""
+SALT_BYTES = 16
+"""Random bytes of a salt: 128 bits, which nobody can try out."""
 SHOWN_REASONS = 3
 """How many skipped frames an error names, so that it stays one line."""
 
@@ -81,7 +85,8 @@ def check_directory(directory: Path, names: Iterable[str], *, overwrite: bool) -
     """
     if directory.exists() and not directory.is_dir():
         raise OutputError(f"{directory} is a file; give a folder for the results.")
-    existing = [name for name in names if (directory / name).exists()]
+    paths = [path for name in names for path in (directory / name, partial_path(directory / name))]
+    existing = [path.name for path in paths if path.exists()]
     if existing and not overwrite:
         raise OutputError(
             f"{directory} already holds {', '.join(existing)}; choose another folder or pass --overwrite."
@@ -92,21 +97,34 @@ def clear_directory(directory: Path, names: Iterable[str]) -> None:
     """Create the folder, and remove the files of an earlier run, so that no old report stays beside new results.
 
     Raises:
-        OutputError: the folder cannot be created, or a file cannot be removed.
+        OutputError: the folder cannot be created, a file cannot be removed, or another process writes it.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for name in names:
-            (directory / name).unlink(missing_ok=True)
+            discard(directory / name)
     except OSError as failure:
         raise OutputError(f"{directory} cannot be written ({failure.strerror}); give another folder.") from failure
 
 
-def recording_identity(scene: "Scene", sensing: str, seed: int, policy: str = "") -> str:
-    """Return the identity that a recording, its truth and its estimate share: a digest of all that they depend on."""
+def new_salt(scene: "Scene") -> str:
+    """Return random text for the identity of a secret scene, so that it does not give the scene away; else nothing."""
+    return secrets.token_hex(SALT_BYTES) if scene.secret else ""
+
+
+def recording_identity(scene: "Scene", sensing: str, seed: int, policy: str = "", *, salt: str = "") -> str:
+    """Return the identity that a recording, its truth and its estimate share: a digest of all that they depend on.
+
+    Args:
+        scene: the scene.
+        sensing: what is sensed.
+        seed: seed of the run.
+        policy: name and settings of the policy.
+        salt: see `new_salt`; the truth file holds it.
+    """
     from jiggle_mj.scenes import scene_table  # imported here, so that a recording can be estimated without MuJoCo
 
-    return identity(scene_table(scene), sensing, seed, policy)
+    return identity(scene_table(scene), sensing, seed, policy, *([salt] if salt else []))
 
 
 def observe(
@@ -116,6 +134,7 @@ def observe(
     *,
     seed: int,
     policy: str = "",
+    salt: str | None = None,
     overwrite: bool = False,
     watch: Stopwatch | None = None,
     on_refused: Callable[[ActionError], bool] | None = None,
@@ -128,6 +147,7 @@ def observe(
         path: the recording to write, with the truth in a separate file beside it; None to record nothing.
         seed: seed of the run, for the recording's metadata.
         policy: name of the policy that chooses the actions, with its settings; empty for the scene's programme.
+        salt: the salt of the identity; None for a new one.
         overwrite: replace existing files.
         watch: accumulates the time of the simulation.
         on_refused: called with the error of an action that cannot be executed; returns whether to continue with the
@@ -142,13 +162,11 @@ def observe(
         recording = truth_file = None
         if path is not None:
             initial_truth = reference.truth()
-            name = recording_identity(reference.scene, reference.sensing, seed, policy)
-            run_metadata = {
-                "name": initial_truth.scene,
-                "seed": str(seed),
-                "sensing": reference.sensing,
-                "identity": name,
-            }
+            salt = new_salt(reference.scene) if salt is None else salt
+            name = recording_identity(reference.scene, reference.sensing, seed, policy, salt=salt)
+            run_metadata = {"name": initial_truth.scene, "sensing": reference.sensing, "identity": name}
+            if not reference.scene.secret:
+                run_metadata["seed"] = str(seed)
             recording = files.enter_context(
                 RecordingWriter(
                     path,
@@ -165,8 +183,9 @@ def observe(
                     faces=initial_truth.faces,
                     attached=initial_truth.attached,
                     scene=initial_truth.scene,
-                    details=initial_truth.details,
+                    details=initial_truth.details | {"seed": seed},
                     identity=name,
+                    salt=salt,
                     overwrite=overwrite,
                 )
             )
@@ -187,7 +206,7 @@ def observe(
                 truth_file.write(reference.truth_frame())
             yield observation
         if truth_file is not None:
-            truth_file.conclude(reference.truth().details)
+            truth_file.conclude(reference.truth().details | {"seed": seed})
 
 
 def settings(config: "EstimatorConfig") -> dict[str, str]:

@@ -25,6 +25,7 @@ from .episode import check_directory, clear_directory, observe, recording_identi
 from .errors import OptionError, OutputError, RecordingError, SimulationError
 from .recording.declaration import METADATA
 from .recording.mcap_files import iterate_records, truth_path
+from .recording.truth import salt
 from .worker_processes import WorkerProcesses
 
 TRIES = 3
@@ -199,10 +200,15 @@ def _is_complete(order: _Order) -> bool:
         metadata = next((r.metadata for r in records if isinstance(r, Metadata) and r.name == METADATA), {})
     except RecordingError as failure:
         raise OutputError(f"seed {order.seed} has another file in its place: {failure} {remedy}") from failure
-    if metadata.get("identity") != recording_identity(order.scene, order.sensing, order.seed):
+    truth = truth_path(order.path)
+    try:
+        salted = salt(truth) if truth.exists() else ""
+    except RecordingError as failure:
+        raise OutputError(f"the truth of seed {order.seed} cannot be read: {failure} {remedy}") from failure
+    if metadata.get("identity") != recording_identity(order.scene, order.sensing, order.seed, salt=salted):
         requested = {"name": order.scene.name, "sensing": order.sensing, "seed": str(order.seed)}
         found = {key: metadata.get(key, "unknown") for key in requested}
         same_name = "a scene of that name with other contents or disturbances"
         what = same_name if found == requested else f"{found}, not {requested}"
         raise OutputError(f"{order.path} is a recording of {what}. {remedy}")
-    return truth_path(order.path).exists()
+    return truth.exists()

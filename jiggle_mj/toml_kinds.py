@@ -12,6 +12,10 @@ from jaxtyping import Float
 
 from .errors import RecordingError
 
+MAX_SHOWN = 200
+"""Most characters of a wrong value that an error quotes."""
+MAX_COUNT = (1 << 31) - 1
+"""Largest whole number: signed 32 bits, in which recordings store numbers of points and grasps."""
 REQUIRED = object()
 """Default of a key without a default."""
 
@@ -36,7 +40,7 @@ class StrictTable:
         try:
             return kind(self.values[key])
         except TypeError as failure:
-            raise RecordingError(f"{self.where} {key} must be {failure}; got {self.values[key]!r}.") from failure
+            raise RecordingError(f"{self.where} {key} must be {failure}; got {shown(self.values[key])}.") from failure
 
     def table(self, key: str, *, optional: bool = False) -> "StrictTable":
         """Return the table under a key; an optional table that is missing is empty."""
@@ -66,6 +70,15 @@ class StrictTable:
             )
 
 
+def shown(value: Any) -> str:
+    """Return a value as an error quotes it: at most `MAX_SHOWN` characters, on one line."""
+    try:
+        written = repr(value[:MAX_SHOWN] if isinstance(value, str | bytes) else value)
+    except (RecursionError, ValueError):
+        written = f"a {type(value).__name__} too large to show"
+    return written if len(written) <= MAX_SHOWN else written[:MAX_SHOWN] + "..."
+
+
 def text(value: Any) -> str:
     """Return a string."""
     if not isinstance(value, str):
@@ -89,21 +102,35 @@ def flag(value: Any) -> bool:
 
 def number(value: Any) -> float:
     """Return a finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise TypeError("a number")
-    return float(value)
+    return _finite(value, "a number")
 
 
 def positive(value: Any) -> float:
     """Return a finite number above 0."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+    real = _finite(value, "a number above 0")
+    if not real > 0:
         raise TypeError("a number above 0")
-    return float(value)
+    return real
+
+
+def not_negative(value: Any) -> float:
+    """Return a finite number of at least 0."""
+    real = _finite(value, "a number from 0")
+    if not real >= 0:
+        raise TypeError("a number from 0")
+    return real
+
+
+def integer(value: Any) -> int:
+    """Return an integer that fits 32 bits; a float that is whole counts, as some writers of JSON know no others."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_COUNT or value % 1:
+        raise TypeError(f"a whole number from -{MAX_COUNT} to {MAX_COUNT}")
+    return int(value)
 
 
 def count(value: Any) -> int:
-    """Return an integer of at least 0."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+    """Return an integer from 0 to `MAX_COUNT`."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_COUNT:
         raise TypeError("a whole number from 0")
     return value
 
@@ -134,3 +161,22 @@ def table(value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise TypeError("a table")
     return value
+
+
+def tables(value: Any) -> list[dict[str, Any]]:
+    """Return a list of tables as it is."""
+    if not isinstance(value, list):
+        raise TypeError("a list of tables")
+    return [table(item) for item in value]
+
+
+def _finite(value: Any, kind: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(kind)
+    try:
+        real = float(value)
+    except OverflowError:
+        raise TypeError(kind) from None
+    if not math.isfinite(real):
+        raise TypeError(kind)
+    return real

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from jiggle_mj.errors import SceneError
+from jiggle_mj.toml_kinds import MAX_SHOWN, shown
 
 from .disturbances.registry import disturbance_class
 from .scene.attachments import SHAPES, Attachment
@@ -75,11 +76,13 @@ def load_scene(name_or_path: str | Path) -> Scene:
             "and the path of a scene file ends in .toml."
         )
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
         raise SceneError(f"cannot read the scene file {path}: {error}.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SceneError(f"{path} is not valid TOML: {error}.") from None
+    try:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # tomllib.TOMLDecodeError, or a number of thousands of digits
+        raise SceneError(f"{path} is not valid TOML: {str(error)[:MAX_SHOWN]}.") from None
     return scene_from_table(table, name=path.stem)
 
 
@@ -93,10 +96,10 @@ def scene_from_table(table: dict[str, Any], *, name: str) -> Scene:
     _refuse_unknown(table, known, where="the scene")
     seed = table.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
-        raise SceneError(f"seed = {seed!r}: must be a whole number in [0, 2^32).")
+        raise SceneError(f"seed = {shown(seed)}: must be a whole number in [0, 2^32).")
     secret = table.get("secret", False)
     if not isinstance(secret, bool):
-        raise SceneError(f"secret = {secret!r}: must be true or false.")
+        raise SceneError(f"secret = {shown(secret)}: must be true or false.")
     sections = {key: _section(cls, table[key], where=key) for key, cls in SECTIONS.items() if key in table}
     shapes = tuple(_attachment(entry, where=where) for where, entry in _tables(table, "attachments"))
     disturbances = tuple(_disturbance(entry, where=where) for where, entry in _tables(table, "disturbances"))
@@ -107,17 +110,17 @@ def _tables(table: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, An
     """Yield the tables of an array, each with its place for messages."""
     entries = table.get(key, [])
     if not isinstance(entries, list):
-        raise SceneError(f"{key} = {entries!r}: must be an array of tables, each headed [[{key}]].")
+        raise SceneError(f"{key} = {shown(entries)}: must be an array of tables, each headed [[{key}]].")
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            raise SceneError(f"{key}[{i}] = {entry!r}: must be a table headed [[{key}]].")
+            raise SceneError(f"{key}[{i}] = {shown(entry)}: must be a table headed [[{key}]].")
         yield f"{key}[{i}]", entry
 
 
 def _attachment(table: dict[str, Any], *, where: str) -> Attachment:
     shape = table.get("shape")
-    if shape not in SHAPES:
-        raise SceneError(f"{where}.shape = {shape!r}: must be one of {', '.join(map(repr, SHAPES))}.")
+    if not isinstance(shape, str) or shape not in SHAPES:
+        raise SceneError(f"{where}.shape = {shown(shape)}: must be one of {', '.join(map(repr, SHAPES))}.")
     return _section(SHAPES[shape], {k: v for k, v in table.items() if k != "shape"}, where=where)
 
 
@@ -127,7 +130,7 @@ def _disturbance(table: dict[str, Any], *, where: str) -> Disturbance:
 
 def _section(cls: type[Section], table: object, *, where: str) -> Any:
     if not isinstance(table, dict):
-        raise SceneError(f"{where} = {table!r}: must be a table.")
+        raise SceneError(f"{where} = {shown(table)}: must be a table.")
     _refuse_unknown(table, [f.name for f in fields(cls)], where=where)
     missing = [f.name for f in fields(cls) if f.default is MISSING and f.name not in table]
     if missing:
@@ -141,7 +144,7 @@ def _section(cls: type[Section], table: object, *, where: str) -> Any:
 def _refuse_unknown(table: dict[str, Any], known: list[str], *, where: str) -> None:
     unknown = [key for key in table if key not in known]
     if unknown:
-        raise SceneError(f"unknown key {unknown[0]!r} in {where}; known keys are {', '.join(known)}.")
+        raise SceneError(f"unknown key {shown(unknown[0])} in {where}; known keys are {', '.join(known)}.")
 
 
 def scene_table(scene: Scene) -> dict[str, Any]:

@@ -7,7 +7,6 @@ tool, the camera or the tracker) are also left out one at a time.
 """
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from jiggle_mj.estimator.attribution.dataset import collect_dataset
 from jiggle_mj.estimator.attribution.held_out import from_rest, residuals, rms
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects import LIBRARY
+from jiggle_mj.eval.metrics.result_file import read_json
 from jiggle_mj.recording.reader import Recording
 
 
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("discrepancy", type=Path)
     parser.add_argument("recording", type=Path)
     arguments = parser.parse_args()
-    effects = json.loads(arguments.discrepancy.read_text())["effects"]
+    effects = read_json(arguments.discrepancy, "'jiggle-mj close-loop' writes it")["effects"]
     recording = Recording.open(arguments.recording)
     dataset = collect_dataset(recording.declaration, recording.camera, recording)
     with jax.enable_x64(True):

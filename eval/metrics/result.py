@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jiggle_mj.episode import Episode
+from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.limits import Limits
 from jiggle_mj.recording.estimate import EstimateRecording
@@ -38,8 +39,8 @@ class Run:
 
     scene: str
     """Name of the scene or recording."""
-    seed: int
-    """Seed of the run."""
+    seed: int | None
+    """Seed of the run; None for a secret scene, and for a recording that states none."""
     sensing: str
     """Sensing: stereo, points, particles or cloud."""
     estimator: str
@@ -217,10 +218,12 @@ def _success(procedure: Json, truth: Truth) -> Json:
     """Say whether each act worked, and the procedure: the tissue is free, or the last suture is in place."""
     done = truth.details.get("events", [])
     planned = procedure["acts"]
-    assert isinstance(done, list) and isinstance(planned, list)
-    acts = [act | {"succeeded": event["succeeded"]} for act, event in zip(planned, done, strict=True)]
+    known = isinstance(done, list) and all(isinstance(each, dict) and "succeeded" in each for each in done)
+    if not known or not isinstance(done, list) or not isinstance(planned, list) or len(done) != len(planned):
+        raise RecordingError("the truth does not say of each act whether it succeeded: the run was interrupted?")
+    acts = [act | {"succeeded": bool(event["succeeded"])} for act, event in zip(planned, done, strict=True)]
     if procedure["name"] == "detach":
-        return {"acts": acts, "success": not (truth.frames[-1].stiffness != 0).any()}
+        return {"acts": acts, "success": bool(truth.frames) and not (truth.frames[-1].stiffness != 0).any()}
     return {"acts": acts, "success": bool(acts) and acts[-1]["succeeded"]}
 
 

@@ -12,8 +12,8 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from plotly.subplots import make_subplots
 
-from jiggle_mj.errors import OutputError
 from jiggle_mj.estimate import Sheet
+from jiggle_mj.recording.output_files import write_text
 
 from ..metrics.flat_map import plane_of
 
@@ -124,10 +124,7 @@ def write_page(path: Path, *, name: str, sheet: Sheet, found: Mapping[str, Any])
         detections=[(when, found[f"detection_{when}"]) for when in TIMES if found[f"detection_{when}"] is not None],
         share=lambda value: "-" if value is None else f"{value:.2f}",
     )
-    try:
-        path.write_text(text)
-    except OSError as failure:
-        raise OutputError(f"{path} cannot be written ({failure.strerror}); give another folder.") from failure
+    write_text(path, text)
 
 
 def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:

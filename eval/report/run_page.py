@@ -19,9 +19,9 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from jiggle_mj.camera import StereoCamera
-from jiggle_mj.errors import OutputError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.observation import StereoPair
+from jiggle_mj.recording.output_files import write_text
 from jiggle_mj.truth import Truth
 
 from ..metrics.calibration import reliability
@@ -125,10 +125,7 @@ def write_report(
         plotly=Markup(get_plotlyjs()),
         payload=Markup(json.dumps(payload, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")),
     )
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as failure:
-        raise OutputError(f"{path} cannot be written ({failure.strerror}); give a folder that exists.") from failure
+    write_text(path, text)
 
 
 def _payload(

@@ -24,7 +24,8 @@ from jiggle_mj.estimator.attribution.suggestion import suggest
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.recording.declaration import version_entry
-from jiggle_mj.recording.reader import Recording
+from jiggle_mj.recording.output_files import fills_folder, write_text
+from jiggle_mj.recording.reader import PAIRING_TOLERANCE_NS, Recording
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.truth import Truth
 
@@ -36,6 +37,7 @@ from ..report.discrepancy_page import write_page
 DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
 
 
+@fills_folder
 def close_loop(
     recording_path: Path,
     directory: Path,
@@ -45,6 +47,7 @@ def close_loop(
     suggestion: bool = False,
     overwrite: bool = False,
     allow_truncated: bool = False,
+    tolerance_ns: int = PAIRING_TOLERANCE_NS,
     on_frame: OnFrame = lambda observation, estimate: None,
     log: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
@@ -57,7 +60,8 @@ def close_loop(
         library: effects that are tested; `(*LIBRARY, mine)` adds one.
         suggestion: search the pull that best distinguishes the effects that these frames do not.
         overwrite: replace an earlier run's files.
-        allow_truncated: use the complete part of a recording that was cut off.
+        allow_truncated: use the complete part of a recording, and of a truth, that was cut off.
+        tolerance_ns: largest difference between the stamps of one frame [ns].
         on_frame: called after each frame of the first estimate.
         log: gets a line for each step of the work.
 
@@ -68,7 +72,7 @@ def close_loop(
         JiggleError: what any of the parts raises.
         ValueError: an effect of the library gives no finite derivative, or changes a shape.
     """
-    recording = Recording.open(recording_path, allow_truncated=allow_truncated)
+    recording = Recording.open(recording_path, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     own = (DISCREPANCY, PAGE)
     check_directory(directory, own, overwrite=overwrite)
     clear_directory(directory, own)
@@ -81,12 +85,12 @@ def close_loop(
     sheet, name = dataset.estimator.sheet, recording.metadata.get("name", recording_path.stem)
 
     def write() -> None:
-        (directory / DISCREPANCY).write_text(json.dumps(found, indent=1) + "\n")
+        write_text(directory / DISCREPANCY, json.dumps(found, indent=1) + "\n")
         write_page(directory / PAGE, name=name, sheet=sheet, found=found)
 
     write()
     if truth is not None:
-        opened = read_truth(truth)
+        opened = read_truth(truth, allow_truncated=allow_truncated)
         if opened.identity != recording.metadata.get("identity", ""):
             raise RecordingError(f"{truth} is not the truth of {recording_path}; give the one written with it.")
         last = dataset.frames[-1].index

@@ -23,6 +23,7 @@ from jiggle_mj.episode import (
     check_directory,
     clear_directory,
     estimate,
+    new_salt,
     observe,
     recording_identity,
     settings,
@@ -34,7 +35,8 @@ from jiggle_mj.estimator.planning.policy import INTERRUPTED, Policy
 from jiggle_mj.observation import StereoPair
 from jiggle_mj.recording.estimate import EstimateRecording, read_estimate
 from jiggle_mj.recording.mcap_files import truth_path
-from jiggle_mj.recording.reader import Recording
+from jiggle_mj.recording.output_files import fills_folder
+from jiggle_mj.recording.reader import PAIRING_TOLERANCE_NS, Recording
 from jiggle_mj.truth import Truth
 
 from ..metrics.result import Run, result, score_read
@@ -50,6 +52,7 @@ REPORTED_PACKAGES = ("jiggle-mj", "mujoco", "jax", "numpy", "scipy", "opencv-pyt
 """Packages whose versions are in the report: those that can change a figure."""
 
 
+@fills_folder
 def run_scene(
     scene: "Scene",
     directory: Path,
@@ -103,13 +106,16 @@ def run_scene(
         estimator = Estimator(reference.declaration, reference.camera, config=config, mask=mask, disparity=disparity)
         clear_directory(directory, own)
         description = "" if planner is None else f"{policy}, {steps} steps, {settings(estimator.config)}"
-        about = {RECORDED: scene.name, IDENTITY: recording_identity(scene, sensing, seed, description)}
+        salt = new_salt(scene)
+        name = recording_identity(scene, sensing, seed, description, salt=salt)
+        about = {RECORDED: scene.name, IDENTITY: name}
         frames = observe(
             reference,
             actions(scene, planner, estimator, steps, stop=stop),
             directory / RECORDING,
             seed=seed,
             policy=description,
+            salt=salt,
             watch=watch,
             on_refused=None if planner is None else planner.refused,
         )
@@ -122,7 +128,7 @@ def run_scene(
     run = Run(
         episode=episode,
         scene=scene.name,
-        seed=seed,
+        seed=None if scene.secret else seed,
         sensing=sensing,
         estimator=estimator.config.filter,
         policy=policy,
@@ -140,6 +146,7 @@ def run_scene(
     return scored
 
 
+@fills_folder
 def run_estimator(
     recording_path: Path,
     directory: Path,
@@ -149,6 +156,7 @@ def run_estimator(
     disparity: Disparity | None = None,
     overwrite: bool = False,
     allow_truncated: bool = False,
+    tolerance_ns: int = PAIRING_TOLERANCE_NS,
     on_frame: OnFrame | None = None,
 ) -> Json:
     """Estimate from a recording, which holds observations only, and write the report.
@@ -161,6 +169,7 @@ def run_estimator(
         disparity: see `Estimator`.
         overwrite: replace an earlier run's files.
         allow_truncated: use the complete part of a recording that was cut off.
+        tolerance_ns: largest difference between the stamps of one frame [ns].
         on_frame: called after each frame.
 
     Returns:
@@ -169,7 +178,7 @@ def run_estimator(
     Raises:
         JiggleError: what any of the parts raises.
     """
-    recording = Recording.open(recording_path, allow_truncated=allow_truncated)
+    recording = Recording.open(recording_path, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     own = (ESTIMATE, RESULT, REPORT)
     check_directory(directory, own, overwrite=overwrite)
     estimator = Estimator(recording.declaration, recording.camera, config=config, mask=mask, disparity=disparity)
@@ -180,7 +189,7 @@ def run_estimator(
     run = Run(
         episode=episode,
         scene=name,
-        seed=int(recording.metadata.get("seed", 0)),
+        seed=recording.seed,
         sensing=recording.metadata.get("sensing", "points" if recording.camera is None else "stereo"),
         estimator=estimator.config.filter,
         policy="recorded",
@@ -188,12 +197,17 @@ def run_estimator(
     )
     figures = result(run)
     write_result(directory / RESULT, figures)
-    _report(directory, episode, figures, recording=recording_path)
+    _report(directory, episode, figures, recording=recording_path, tolerance_ns=tolerance_ns)
     return figures
 
 
 def score_directory(
-    directory: Path, truth: Path, *, recording: Path | None = None, log: Callable[[str], None] = lambda _: None
+    directory: Path,
+    truth: Path,
+    *,
+    recording: Path | None = None,
+    allow_truncated: bool = False,
+    log: Callable[[str], None] = lambda _: None,
 ) -> Json:
     """Score an estimate in a folder, and write its report again with the truth.
 
@@ -202,13 +216,14 @@ def score_directory(
         truth: the truth file.
         recording: what was estimated, for the report's pictures; if None, it is searched next to the truth file and in
             the folder.
+        allow_truncated: use the complete frames of a truth that was cut off.
         log: gets a line if the report loses its pictures.
 
     Raises:
         RecordingError: the folder holds no estimate, the file no truth, or one of another recording.
         OutputError: the estimate did not finish.
     """
-    unscored, estimated, opened = read_scorable(directory, truth)
+    unscored, estimated, opened = read_scorable(directory, truth, allow_truncated=allow_truncated)
     if recording is not None and not _is_of(estimated, recording):
         raise RecordingError(f"{recording} is not the recording that {directory} estimates; give that one, or none.")
     figures = score_read(directory, unscored, estimated, opened)
@@ -243,11 +258,12 @@ def _report(
     *,
     recording: Path | None,
     truth: Truth | None = None,
+    tolerance_ns: int = PAIRING_TOLERANCE_NS,
 ) -> None:
     """Write report.html; the pictures come from the recording, if there is one with images."""
     if estimated.belief is None or estimated.detection is None:
         raise OutputError(f"{directory / ESTIMATE} ends before its belief; estimate the recording again.")
-    opened = None if recording is None else Recording.open(recording, allow_truncated=True)
+    opened = None if recording is None else Recording.open(recording, allow_truncated=True, tolerance_ns=tolerance_ns)
     settings: dict[str, object] = {"estimate": dict(read_estimate(directory / ESTIMATE).metadata)}
     if opened is not None:
         declared = asdict(opened.declaration)

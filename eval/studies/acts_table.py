@@ -22,10 +22,12 @@ from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.physics.mesh import SheetMesh
 from jiggle_mj.estimator.planning.procedures import CUT_WIDTH, free_stretch, tour
 from jiggle_mj.recording.declaration import is_current, version_entry
+from jiggle_mj.recording.output_files import write_text
 from jiggle_mj.scenes import Reference, load_scene
 from jiggle_mj.scenes.scene.programme import grasp_points, programme
 from jiggle_mj.scenes.scene.scene import Scene
 
+from ..metrics.result_file import MADE_BY, read_json
 from .study import Study, Table
 
 SCENES = ("arc", "line", "line_dot", "arc_line", "u_shape")
@@ -80,7 +82,7 @@ class ActsStudy(Study[ActsCell, list[Verdict]]):
     def run_cell(self, cell: ActsCell, path: Path) -> None:
         """Write the verdicts of all acts to the cell's file."""
         found = [vars(verdict) for verdict in self.verdicts(cell)]
-        path.write_text(json.dumps(version_entry() | {"verdicts": found}, indent=1) + "\n")
+        write_text(path, json.dumps(version_entry() | {"verdicts": found}, indent=1) + "\n")
 
     def verdicts(self, cell: ActsCell) -> list[Verdict]:
         """Carry out all acts of a cell, and return the evidence about each."""
@@ -88,11 +90,11 @@ class ActsStudy(Study[ActsCell, list[Verdict]]):
 
     def is_current(self, cell: ActsCell, path: Path) -> bool:
         """Say whether this version wrote the file."""
-        return path.exists() and is_current(json.loads(path.read_text()))
+        return path.exists() and is_current(read_json(path, MADE_BY))
 
     def read(self, cell: ActsCell, path: Path) -> list[Verdict]:
         """Read the verdicts from the cell's file."""
-        return [Verdict(**verdict) for verdict in json.loads(path.read_text())["verdicts"]]
+        return [Verdict(**verdict) for verdict in read_json(path, MADE_BY)["verdicts"]]
 
     def summarise(self, results: Mapping[ActsCell, list[Verdict]]) -> Table:
         """Return counts by scene and of all scenes: cuts, then sutures."""

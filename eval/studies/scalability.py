@@ -23,8 +23,10 @@ from jiggle_mj.estimator.planning.information_config import InformationPolicyCon
 from jiggle_mj.estimator.planning.outcomes import outcomes
 from jiggle_mj.estimator.planning.pull_predictor import CandidatePull, PullPredictor
 from jiggle_mj.recording.declaration import is_current, version_entry
+from jiggle_mj.recording.output_files import write_text
 
 from ..benchmark.estimator_benchmark import POINT_SD, Case, case, sl_d, timed
+from ..metrics.result_file import MADE_BY, read_json
 from .figures import UNDEFINED
 from .study import Study, Table
 
@@ -68,18 +70,18 @@ class ScalabilityStudy(Study[int, PlanTimes]):
             _, theirs = timed(sl_d(lift), repeats=REPEATS)
             _, ours = timed(our_plan(lift), repeats=REPEATS)
         times = vars(PlanTimes(sl_d_s=theirs, ours_s=ours))
-        path.write_text(json.dumps(version_entry() | {"device": _device(), "times": times}, indent=1) + "\n")
+        write_text(path, json.dumps(version_entry() | {"device": _device(), "times": times}, indent=1) + "\n")
 
     def is_current(self, cell: int, path: Path) -> bool:
         """Say whether this version measured this size on this kind of device."""
         if not path.exists():
             return False
-        kept = json.loads(path.read_text())
-        return is_current(kept) and kept["device"] == _device()
+        kept = read_json(path, MADE_BY)
+        return is_current(kept) and kept.get("device") == _device()
 
     def read(self, cell: int, path: Path) -> PlanTimes:
         """Read the times of one size."""
-        return PlanTimes(**json.loads(path.read_text())["times"])
+        return PlanTimes(**read_json(path, MADE_BY)["times"])
 
     def summarise(self, results: Mapping[int, PlanTimes]) -> Table:
         """Return a row for each size, with the paper's printed seconds."""

@@ -1,6 +1,5 @@
 """Study of whether closing the loop names the effects that a scene holds and nobody declares."""
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -16,6 +15,7 @@ from jiggle_mj.recording.declaration import is_current
 from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.scenes import Reference, programme
 
+from ..metrics.result_file import MADE_BY, read_json
 from ..runs.closing_the_loop import DISCREPANCY, close_loop
 from .study import Study, Table
 from .undeclared_panel import IMAGES, INSIDE, NOTHING, OUTSIDE, ROWS, TOGETHER, PanelRow, scene_with
@@ -67,11 +67,11 @@ class UndeclaredStudy(Study[UndeclaredCell, Discrepancy]):
     def is_current(self, cell: UndeclaredCell, path: Path) -> bool:
         """Say whether this version wrote the folder's discrepancy.json."""
         file = path / DISCREPANCY
-        return file.exists() and is_current(json.loads(file.read_text()))
+        return file.exists() and is_current(read_json(file, MADE_BY))
 
     def read(self, cell: UndeclaredCell, path: Path) -> Discrepancy:
         """Read discrepancy.json."""
-        return json.loads((path / DISCREPANCY).read_text())
+        return read_json(path / DISCREPANCY, MADE_BY)
 
     def summarise(self, results: Mapping[UndeclaredCell, Discrepancy]) -> Table:
         """Return a row for each row of the panel, and sums over its groups beneath."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.table import Table
 
 from ..options import FilterName, PolicyName, Sensing
-from .options import AsJson, Disturb, Name, Out, PathArgument
+from .options import PAIRING_TOLERANCE_MS, AsJson, Disturb, Name, Out, PairingTolerance, PathArgument, in_ns
 from .terminal import INTERRUPTED, console, deferred_interrupt, progress, show, stop
 
 
@@ -76,6 +76,7 @@ def estimate(
     *,
     out: Out,
     estimator: FilterName = "implicit",
+    pairing_tolerance: PairingTolerance = PAIRING_TOLERANCE_MS,
     allow_truncated: bool = False,
     overwrite: bool = False,
     as_json: AsJson = False,
@@ -87,6 +88,7 @@ def estimate(
         out: folder for estimate.mcap, result.json and report.html.
         estimator: implicit is ours; explicit is the paper's filter and adam the paper's baseline; nnls and unscented
             are further baselines.
+        pairing_tolerance: largest difference between the stamps of the images of one frame [ms].
         allow_truncated: use the complete frames of a recording that was cut off.
         overwrite: replace the results in the folder.
         as_json: print result.json to stdout.
@@ -96,7 +98,8 @@ def estimate(
 
     from ..recording.reader import Recording
 
-    length = len(Recording.open(recording, allow_truncated=allow_truncated))
+    tolerance_ns = in_ns(pairing_tolerance)
+    length = len(Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns))
     with progress(length, f"estimate {recording.name}") as on_frame:
         figures = run_estimator(
             recording,
@@ -104,16 +107,25 @@ def estimate(
             config=EstimatorConfig(filter=estimator),
             overwrite=overwrite,
             allow_truncated=allow_truncated,
+            tolerance_ns=tolerance_ns,
             on_frame=on_frame,
         )
     show(figures, out, as_json)
 
 
-def identify(recording: PathArgument, /, *, allow_truncated: bool = False, as_json: AsJson = False) -> None:
+def identify(
+    recording: PathArgument,
+    /,
+    *,
+    pairing_tolerance: PairingTolerance = PAIRING_TOLERANCE_MS,
+    allow_truncated: bool = False,
+    as_json: AsJson = False,
+) -> None:
     """Identify the sheet's weight and bending stiffness, relative to its membrane stiffness, from a recording.
 
     Args:
         recording: an MCAP file of observations.
+        pairing_tolerance: largest difference between the stamps of the images of one frame [ms].
         allow_truncated: use the complete frames of a recording that was cut off.
         as_json: print the ratios, the refusals and the resulting declaration to stdout as JSON.
     """
@@ -122,7 +134,7 @@ def identify(recording: PathArgument, /, *, allow_truncated: bool = False, as_js
     from .. import episode
     from ..recording.reader import Recording
 
-    source = Recording.open(recording, allow_truncated=allow_truncated)
+    source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=in_ns(pairing_tolerance))
     estimator = Estimator(source.declaration, source.camera)
     with progress(len(source), f"estimate {recording.name}") as on_frame:
         episode.estimate(source, estimator, on_frame=on_frame)
@@ -157,6 +169,7 @@ def close_loop(
     out: Out,
     truth: Path | None = None,
     suggest: bool = False,
+    pairing_tolerance: PairingTolerance = PAIRING_TOLERANCE_MS,
     allow_truncated: bool = False,
     overwrite: bool = False,
     as_json: AsJson = False,
@@ -168,6 +181,7 @@ def close_loop(
         out: folder for discrepancy.json and discrepancy.html.
         truth: a truth file, to score the detected attachments before and after; it is read after the verdict.
         suggest: where several effects explain the frames, search the next pull that discriminates between them.
+        pairing_tolerance: largest difference between the stamps of the images of one frame [ms].
         allow_truncated: use the complete frames of a recording that was cut off.
         overwrite: replace the results in the folder.
         as_json: print discrepancy.json to stdout.
@@ -178,7 +192,8 @@ def close_loop(
 
     from ..recording.reader import Recording
 
-    length = len(Recording.open(recording, allow_truncated=allow_truncated))
+    tolerance_ns = in_ns(pairing_tolerance)
+    length = len(Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns))
     with progress(length, f"follow {recording.name}") as on_frame:
         discrepancy = close(
             recording,
@@ -186,6 +201,7 @@ def close_loop(
             truth=truth,
             suggestion=suggest,
             allow_truncated=allow_truncated,
+            tolerance_ns=tolerance_ns,
             overwrite=overwrite,
             on_frame=on_frame,
             log=lambda text: console.print(text, highlight=False, markup=False),
@@ -198,7 +214,15 @@ def close_loop(
         print(json.dumps(discrepancy))
 
 
-def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = None, as_json: AsJson = False) -> None:
+def score(
+    directory: PathArgument,
+    /,
+    *,
+    truth: Path,
+    recording: Path | None = None,
+    allow_truncated: bool = False,
+    as_json: AsJson = False,
+) -> None:
     """Score an estimate against the true attachments, and add them to its report.
 
     Args:
@@ -206,8 +230,10 @@ def score(directory: PathArgument, /, *, truth: Path, recording: Path | None = N
         truth: the truth file, for example run.truth.mcap.
         recording: the recording that was estimated, for the pictures of the report; if left out, it is searched beside
             the truth and in the folder.
+        allow_truncated: use the complete frames of a truth that was cut off.
         as_json: print result.json to stdout.
     """
     from jiggle_mj.eval.runs.experiment import score_directory
 
-    show(score_directory(directory, truth, recording=recording, log=console.print), directory, as_json)
+    figures = score_directory(directory, truth, recording=recording, allow_truncated=allow_truncated, log=console.print)
+    show(figures, directory, as_json)

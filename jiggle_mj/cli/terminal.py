@@ -67,7 +67,7 @@ def progress(total: int, title: str) -> "Iterator[OnFrame]":
 @contextmanager
 def bar(total: int, title: str) -> Iterator[Callable[..., None]]:
     """Yield a function that advances a bar on stderr by one part, with a note beside it."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as shown:
         task = shown.add_task(title, total=total)
         yield lambda note="": shown.update(task, advance=1, description=title + note)
@@ -79,7 +79,8 @@ def show(figures: dict, out: Path, as_json: bool) -> None:
 
     detection, calibration = figures["detection"], figures["calibration"]
     console.print(
-        f"{detection['n_detected']} of {figures['n_particles']} particles reported attached ({detection['rule']})"
+        f"{detection['n_detected']} of {figures['n_particles']} particles reported attached ({detection['rule']})",
+        markup=False,
     )
     if detection["n_attached"] is not None:
         table = Table("rings", "PCD %", "PUG %", "F1 %", box=None)
@@ -94,11 +95,11 @@ def show(figures: dict, out: Path, as_json: bool) -> None:
             parts.append(f"tracking RMS {1e3 * figures['tracking']['rms_m']:.2f} mm")
         console.print(", ".join(parts))
     for skipped in figures["frames"]["skipped"]:
-        console.print(f"frame {skipped['index']} skipped: {skipped['why']}")
+        console.print(f"frame {skipped['index']} skipped: {skipped['why']}", markup=False, highlight=False)
     for index in figures["frames"]["not_converged"]:
         console.print(f"frame {index}: the search for the sheet's state did not converge; trust this frame less.")
     for doubt in doubts(figures):
         console.print(doubt)
-    console.print(f"report: {out / 'report.html'}")
+    console.print(f"report: {out / 'report.html'}", markup=False)
     if as_json:
         print(json.dumps(figures))

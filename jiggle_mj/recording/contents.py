@@ -11,22 +11,27 @@ from pathlib import Path
 from typing import Any
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration as CalibrationMessage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from google.protobuf.message import DecodeError
-from mcap.records import Channel, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from ..actions import Cut, Suture
 from ..errors import RecordingError
 from ..observation import Declaration
+from ..toml_kinds import MAX_SHOWN
 from .declaration import DECLARATION, DECLARED_MESH, METADATA, parse_declaration, with_mesh
 from .events import parse_event
 from .frames import FrameTree
 from .mcap_files import iterate_records
+from .messages import checked_stamp, parse_message
 from .pairing import Stamped
 from .refusals import refuse_incomplete, refuse_truth
 from .schemas import parse_grasp, stamp_of
 from .topics import EVENT, GRASP, JSON_TOPICS, LEFT, POINTS, POSE, RIGHT, SCHEMAS
+
+MAX_MESSAGES = 1_000_000
+"""Most messages of the topics that are read: a report of the tool each ms for a quarter of an hour, 1 GB in memory."""
 
 
 class RecordingContents:
@@ -48,14 +53,24 @@ class RecordingContents:
         self.events: list[tuple[int, Cut | Suture]] = []
         """Cuts and sutures, each with its stamp [ns], by stamp."""
         self._classes: dict[int, Any] = {}
+        self._declared_mesh: Attachment | None = None
         ignored: Counter[str] = Counter()
+        n_read = 0
         for ordinal, topic, message in self._messages():
+            n_read += topic in JSON_TOPICS or topic in SCHEMAS
+            if n_read > MAX_MESSAGES:
+                raise RecordingError(
+                    f"{path} has more than {MAX_MESSAGES} messages; cut it into shorter recordings, or thin "
+                    f"the reports on {POSE}."
+                )
             if topic == EVENT:
-                self.events.append((message.log_time, parse_event(message.data)))
+                self.events.append((checked_stamp(message.log_time, topic), parse_event(message.data)))
             elif topic == GRASP or topic in SCHEMAS:
                 self._store(ordinal, topic, message)
             else:
                 ignored[topic] += 1
+        if self._declared_mesh is not None:
+            self.declaration = with_mesh(self.declaration, self._declared_mesh, path)
         self.events.sort(key=lambda event: event[0])
         self.ignored = dict(sorted(ignored.items()))
         present = {topic for topic, messages in self.stamped.items() if messages} | set(self.calibrations)
@@ -85,14 +100,14 @@ class RecordingContents:
             if isinstance(parsed, CalibrationMessage):
                 self.calibrations.setdefault(topic, parsed)
                 return
-            if isinstance(parsed, FrameTransforms):
-                self.frames.add(parsed)
+            if isinstance(parsed, FrameTransforms | FrameTransform):
+                self.frames.add(parsed.transforms if isinstance(parsed, FrameTransforms) else (parsed,))
                 return
             if isinstance(parsed, PoseInFrame):
                 self.poses[ordinal] = parsed
             if parsed.HasField("timestamp"):
                 stamp = stamp_of(parsed)
-        self.stamped[topic].append(Stamped(stamp=stamp, ordinal=ordinal))
+        self.stamped[topic].append(Stamped(stamp=checked_stamp(stamp, topic), ordinal=ordinal))
 
     def _messages(self) -> Iterator[tuple[int, str, Message]]:
         """Yield each message with its ordinal and topic; store metadata and declaration as they come."""
@@ -101,6 +116,10 @@ class RecordingContents:
         ordinal = 0
         for record in iterate_records(self.path, allow_truncated=self._allow_truncated):
             if isinstance(record, Message):
+                if record.channel_id not in topics:
+                    raise RecordingError(
+                        f"{self.path} is damaged: a message has the unknown channel {record.channel_id}."
+                    )
                 yield ordinal, topics[record.channel_id], record
                 ordinal += 1
             elif isinstance(record, Schema):
@@ -115,19 +134,14 @@ class RecordingContents:
                 elif record.name == DECLARATION:
                     self.declaration = parse_declaration(record.metadata.get("json", ""))
             elif record.name == DECLARED_MESH:
-                self.declaration = with_mesh(self.declaration, record, self.path)
+                self._declared_mesh = record
 
     def _parse(self, topic: str, message: Message) -> Any:
-        message_class = self._classes[message.channel_id]
-        try:
-            return message_class.FromString(message.data)
-        except DecodeError as failure:
-            raise RecordingError(
-                f"{self.path}: a message on {topic} is not a {message_class.__name__}: {failure}."
-            ) from failure
+        return parse_message(self._classes[message.channel_id], message.data, f"{self.path}: a message on {topic}")
 
     def _choose_class(self, channel: Channel, schema: Schema | None) -> None:
-        name, encoding = (schema.name if schema else "without a schema"), channel.message_encoding
+        name = (schema.name if schema else "without a schema")[:MAX_SHOWN]
+        encoding = channel.message_encoding[:MAX_SHOWN]
         if channel.topic in JSON_TOPICS and encoding != "json":
             raise RecordingError(f"{self.path}: {channel.topic} is {name} ({encoding}); it must be JSON.")
         if channel.topic not in SCHEMAS:

@@ -15,7 +15,10 @@ from mcap.records import Attachment
 
 from ..errors import RecordingError
 from ..observation import Declaration, DeclaredMesh
+from ..toml_kinds import MAX_COUNT, flag, number, positive, shown, vector
+from .json_values import entry, parse_object
 from .mcap_files import McapOutput, read_arrays
+from .stored_arrays import StoredArrays
 
 METADATA, DECLARATION, DECLARED_MESH = "jiggle_mj", "jiggle_mj.declaration", "declared_mesh.npz"
 """Names of two metadata records and of an attachment."""
@@ -23,6 +26,17 @@ FORMAT = "1"
 """Version of the layout that docs/RECORDINGS.md describes."""
 VERSION = "version.jiggle-mj"
 """Key of this package's version in the metadata."""
+KINDS = {
+    "membrane_stiffness": positive,
+    "poisson": number,
+    "thickness": positive,
+    "areal_density": positive,
+    "gravity": vector,
+    "bed": flag,
+}
+"""Kind of each field of a declaration but its mesh."""
+MAX_VERTICES = 20_000
+"""Most vertices of a declared mesh: a belief of more does not fit 2 GB, and a length in a wrong unit is refused."""
 IDENTITY_DIGITS = 16
 """Hexadecimal digits of an identity: 64 bits, so that no two of a million recordings are likely to share one."""
 
@@ -66,25 +80,40 @@ def parse_declaration(text: str) -> Declaration:
     Raises:
         RecordingError: not JSON, an unknown field, or a value that `Declaration` refuses.
     """
+    where = "the recording's declaration"
+    values = parse_object(text, where)
+    unknown = sorted(set(values) - set(KINDS))
+    if unknown:
+        raise RecordingError(f"{where} has the unknown key {shown(unknown[0])}; known: {', '.join(KINDS)}.")
+    known = {name: entry(values, name, KINDS[name], where) for name in values}
+    if "gravity" in known:
+        known["gravity"] = tuple(known["gravity"])
     try:
-        values = json.loads(text)
-        if "gravity" in values:
-            values["gravity"] = tuple(values["gravity"])
-        return Declaration(**values)
-    except (TypeError, ValueError) as failure:
-        raise RecordingError(f"the recording's declaration cannot be read ({failure}): {text[:120]}") from failure
+        return Declaration(**known)
+    except ValueError as failure:
+        raise RecordingError(f"{where} cannot be used: {failure}") from failure
 
 
 def with_mesh(declaration: Declaration, attachment: Attachment, path: Path) -> Declaration:
     """Return the declaration with the mesh of an attachment.
 
     Raises:
-        RecordingError: the attachment lacks an array, or holds an unknown one.
+        RecordingError: the attachment lacks an array, holds an unknown one, or one of a wrong shape, type or range.
     """
-    arrays = read_arrays(attachment, path)
-    try:
-        return replace(declaration, mesh=DeclaredMesh(**arrays))
-    except TypeError as failure:
+    arrays = StoredArrays(read_arrays(attachment, path), f"{path}: {DECLARED_MESH}")
+    required, known = {"vertices", "faces", "track_id"}, {"vertices", "faces", "track_id", "held"}
+    if not all(name in arrays for name in required) or not arrays.only(known):
         raise RecordingError(
-            f"{path}: {DECLARED_MESH} must hold vertices, faces, track_id and perhaps held; it has {', '.join(arrays)}."
-        ) from failure
+            f"{path}: {DECLARED_MESH} must hold vertices, faces, track_id and perhaps held; it has {arrays.names()}."
+        )
+    vertices = arrays.positions("vertices", (None, 3), finite=True)
+    n = len(vertices)
+    if n > MAX_VERTICES:
+        raise RecordingError(f"{path}: the declared mesh has {n} vertices; at most {MAX_VERTICES} can be estimated.")
+    mesh = DeclaredMesh(
+        vertices=vertices,
+        faces=arrays.indices("faces", (None, 3), below=n),
+        track_id=arrays.indices("track_id", (n,), from_=-1, below=MAX_COUNT),
+        held=arrays.flags("held", (n,)) if "held" in arrays else None,
+    )
+    return replace(declaration, mesh=mesh)

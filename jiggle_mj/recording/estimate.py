@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar, cast
+from typing import Any, Self
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -19,13 +19,17 @@ from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from jaxtyping import Float
-from mcap.records import Attachment, Channel, Message, Metadata
+from mcap.records import Message
 
 from ..errors import RecordingError
 from ..estimate import Belief, Detection, Estimate, Sheet
+from ..toml_kinds import count, flag, number, text
 from .declaration import METADATA, file_metadata
-from .mcap_files import McapOutput, iterate_records, read_arrays
+from .json_values import entry, optional, parse_list, parse_object
+from .mcap_files import McapOutput, read_arrays
+from .messages import checked_stamp, parse_message, read_messages, refuse_disorder
 from .schemas import WORLD, fill_pose, parse_points, point_cloud, timestamp
+from .stored_arrays import StoredArrays
 
 ESTIMATE_POINTS, ESTIMATE_MESH, DIAGNOSTICS = "/estimate/points", "/estimate/mesh", "/diagnostics/filter"
 """Topics."""
@@ -46,7 +50,6 @@ DIAGNOSTICS_SCHEMA: dict[str, object] = {
     },
     "required": ["index", "entropy", "nis", "boundary_energy", "skipped"],
 }
-Stored = TypeVar("Stored")
 COLOURS = np.array(
     [[0.267, 0.005, 0.329], [0.229, 0.322, 0.546], [0.128, 0.567, 0.551], [0.369, 0.789, 0.383], [0.993, 0.906, 0.144]]
 )
@@ -153,67 +156,105 @@ def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False
         RecordingError: missing, not an MCAP, truncated, damaged, not an estimate, or written by another version.
     """
     path = Path(path)
-    topics: dict[int, str] = {}
-    messages: dict[str, list[Message]] = {ESTIMATE_POINTS: [], DIAGNOSTICS: []}
-    arrays: dict[str, dict[str, np.ndarray]] = {}
-    metadata: dict[str, dict[str, str]] = {}
-    for record in iterate_records(path, allow_truncated=allow_truncated):
-        if isinstance(record, Channel):
-            topics[record.id] = record.topic
-        elif isinstance(record, Message) and topics[record.channel_id] in messages:
-            messages[topics[record.channel_id]].append(record)
-        elif isinstance(record, Attachment) and record.name in (SHEET, BELIEF, DETECTION):
-            arrays[record.name] = read_arrays(record, path)
-        elif isinstance(record, Metadata):
-            metadata[record.name] = dict(record.metadata)
-    if SHEET not in arrays:
-        names = ", ".join(sorted(set(topics.values()))) or "none"
-        raise RecordingError(f"{path} is not an estimate: it lacks {SHEET}; its topics are: {names}.")
-    result = metadata.get(RESULT_RECORD)
+    content = read_messages(path, (ESTIMATE_POINTS, DIAGNOSTICS), allow_truncated=allow_truncated)
+    if SHEET not in content.attachments:
+        raise RecordingError(f"{path} is not an estimate: it lacks {SHEET}; its topics are: {content.topics}.")
+    arrays = {
+        name: StoredArrays(read_arrays(content.attachments[name], path), f"{path}: {name}")
+        for name in (SHEET, BELIEF, DETECTION)
+        if name in content.attachments
+    }
+    rest = arrays[SHEET].positions("rest", (None, 3), finite=True)
+    n = len(rest)
+    if n == 0:
+        raise RecordingError(f"{path} is damaged: {SHEET} has no particles.")
+    result = content.metadata.get(RESULT_RECORD)
+    finished = result is not None and BELIEF in arrays and DETECTION in arrays
+    frames = tuple(
+        _parse(points, diagnostics, n, path)
+        for points, diagnostics in content.frames(ESTIMATE_POINTS, DIAGNOSTICS, complete=not allow_truncated)
+    )
+    refuse_disorder(frames, path)
     return EstimateRecording(
-        sheet=_stored(Sheet, arrays[SHEET], path),
-        estimates=tuple(_parse(*pair) for pair in zip(messages[ESTIMATE_POINTS], messages[DIAGNOSTICS], strict=False)),
-        belief=_stored(Belief, arrays[BELIEF], path) if result else None,
-        detection=_stored(Detection, arrays[DETECTION] | {"rule": result["rule"]}, path) if result else None,
-        skipped=tuple((index, why) for index, why in json.loads(result["skipped"])) if result else (),
-        metadata=metadata.get(METADATA, {}),
+        sheet=Sheet(rest=rest, faces=arrays[SHEET].indices("faces", (None, 3), below=n)),
+        estimates=frames,
+        belief=_belief(arrays[BELIEF], n, path) if finished else None,
+        detection=_detection(arrays[DETECTION], result, n, path) if finished and result else None,
+        skipped=_skipped(result, path) if result else (),
+        metadata=content.metadata.get(METADATA, {}),
     )
 
 
-def _parse(points: Message, diagnostics: Message) -> Estimate:
-    columns = parse_points(PointCloud.FromString(points.data), ESTIMATE_POINTS)
-    diagnosed = json.loads(diagnostics.data)
-    numbers = {
-        name: math.nan if diagnosed[name] is None else float(diagnosed[name])
-        for name in ("entropy", "nis", "boundary_energy")
-    }
+def _parse(points: Message, diagnostics: Message, n: int, path: Path) -> Estimate:
+    where = f"{path}: {ESTIMATE_POINTS}"
+    columns = StoredArrays(parse_points(parse_message(PointCloud, points.data, where), where), where)
+    values, named = parse_object(diagnostics.data, DIAGNOSTICS), f"{path}: {DIAGNOSTICS}"
+
+    def number_or_nan(name: str) -> float:
+        value = entry(values, name, optional(number), named)
+        return math.nan if value is None else value
+
     return Estimate(
-        index=diagnosed["index"],
-        time=points.log_time,
-        positions=np.column_stack([columns[axis] for axis in "xyz"]),
-        observed=np.column_stack([columns[f"observed_{axis}"] for axis in "xyz"]),
-        mean=columns["b_mean"],
-        sd=columns["b_sd"],
-        probability=columns["p_attached"],
-        held=columns["held"].astype(bool),
+        index=entry(values, "index", count, named),
+        time=checked_stamp(points.log_time, where),
+        positions=np.column_stack([columns.positions(axis, (n,)) for axis in "xyz"]),
+        observed=np.column_stack([columns.positions(f"observed_{axis}", (n,)) for axis in "xyz"]),
+        mean=columns.numbers("b_mean", (n,)),
+        sd=columns.numbers("b_sd", (n,)),
+        probability=columns.numbers("p_attached", (n,)),
+        held=columns.flags("held", (n,)),
         update_s=0.0,
         perception_s=0.0,
-        converged=diagnosed.get("converged", True),
-        **numbers,
+        converged=entry(values, "converged", flag, named, True),
+        entropy=number_or_nan("entropy"),
+        nis=number_or_nan("nis"),
+        boundary_energy=number_or_nan("boundary_energy"),
     )
 
 
-def _stored(kind: type[Stored], values: dict[str, Any], path: Path) -> Stored:
-    """Return a dataclass from its stored arrays; arrays without a dimension become numbers."""
-    known = fields(cast(Any, kind))
-    missing = [field.name for field in known if field.default is MISSING and field.name not in values]
+def _belief(arrays: StoredArrays, n: int, path: Path) -> Belief:
+    _refuse_other_version(Belief, arrays, set(), path)
+    return Belief(
+        mean=arrays.numbers("mean", (n,)),
+        covariance=arrays.numbers("covariance", (n, n)),
+        **{name: arrays.scalar(name) for name in ("reference",) if name in arrays},
+        **{name: arrays.numbers(name, (n,)) for name in ("lower", "upper") if name in arrays},
+    )
+
+
+def _detection(arrays: StoredArrays, result: dict[str, str], n: int, path: Path) -> Detection:
+    _refuse_other_version(Detection, arrays, {"rule"}, path)
+    return Detection(
+        attached=arrays.flags("attached", (n,)),
+        **{name: arrays.numbers(name, (n,)) for name in ("score", "stiffness", "stiffness_sd")},
+        **{name: bool(arrays.flags(name, ())) for name in ("probabilistic", "converged") if name in arrays},
+        **{name: arrays.scalar(name) for name in ("force_sd_ratio", "position_sd_ratio") if name in arrays},
+        rule=entry(result, "rule", text, f"{path}: {RESULT_RECORD}"),
+    )
+
+
+def _skipped(result: dict[str, str], path: Path) -> tuple[tuple[int, str], ...]:
+    where = f"{path}: {RESULT_RECORD} skipped"
+
+    def reason(value: Any) -> tuple[int, str]:
+        if not isinstance(value, list) or len(value) != 2:
+            raise TypeError("a list [index, reason]")
+        return count(value[0]), text(value[1])
+
+    return tuple(parse_list(entry(result, "skipped", text, where), reason, where))
+
+
+def _refuse_other_version(
+    kind: type[Belief | Detection], arrays: StoredArrays, elsewhere: set[str], path: Path
+) -> None:
+    """Refuse arrays that lack a field of the dataclass which has no default."""
+    needed = [field.name for field in fields(kind) if field.default is MISSING and field.name not in elsewhere]
+    missing = [name for name in needed if name not in arrays]
     if missing:
         raise RecordingError(
             f"{path} was written by another version of jiggle-mj: its {kind.__name__} lacks {', '.join(missing)}. "
             "Estimate again from the recording."
         )
-    numbers = {name: value.item() if getattr(value, "ndim", 1) == 0 else value for name, value in values.items()}
-    return kind(**{field.name: numbers[field.name] for field in known if field.name in numbers})
 
 
 def _json_number(value: float) -> float | None:

@@ -1,11 +1,17 @@
 """Cuts and sutures as messages: the intended change, not whether it succeeded."""
 
-import json
+from typing import Any
 
 import numpy as np
 
 from ..actions import Cut, Suture
 from ..errors import RecordingError
+from ..toml_kinds import number, positive, shown, text
+from .json_values import entry, parse_object
+from .topics import EVENT
+
+MAX_CORNERS = 10_000
+"""Most corners of a cut's or a suture's middle line."""
 
 EVENT_SCHEMA: dict[str, object] = {
     "title": "jiggle_mj.Topology",
@@ -40,15 +46,21 @@ def parse_event(data: bytes) -> Cut | Suture:
     Raises:
         RecordingError: not JSON, or a field missing or of the wrong kind.
     """
-    try:
-        value = json.loads(data)
-        path, width = np.array(value["path"], dtype=float), float(value["width"])
-        if path.ndim != 2 or path.shape[1] != 2 or value["kind"] not in ("cut", "suture"):
-            raise ValueError("path must be a list of [x, y], kind 'cut' or 'suture'")
-        if value["kind"] == "cut":
-            return Cut(path=path, width=width)
-        return Suture(path=path, width=width, stiffness=float(value["stiffness"]))
-    except (KeyError, TypeError, ValueError) as failure:
-        raise RecordingError(
-            f"/event/topology must be JSON {{kind, path, width, stiffness}}; got {data[:80]!r} ({failure!r})."
-        ) from failure
+    value = parse_object(data, EVENT)
+    kind = entry(value, "kind", text, EVENT)
+    path, width = np.array(entry(value, "path", _corners, EVENT)), entry(value, "width", positive, EVENT)
+    if kind == "cut":
+        return Cut(path=path, width=width)
+    if kind == "suture":
+        return Suture(path=path, width=width, stiffness=entry(value, "stiffness", positive, EVENT))
+    raise RecordingError(f"{EVENT} has kind = {shown(kind)}; it must be 'cut' or 'suture'.")
+
+
+def _corners(value: Any) -> list[list[float]]:
+    """Return the corners of a region's middle line."""
+    kind = f"a list of 1 to {MAX_CORNERS} points [x, y] in m"
+    if not isinstance(value, list) or not 0 < len(value) <= MAX_CORNERS:
+        raise TypeError(kind)
+    if any(not isinstance(corner, list) or len(corner) != 2 for corner in value):
+        raise TypeError(kind)
+    return [[number(coordinate) for coordinate in corner] for corner in value]

@@ -4,16 +4,23 @@ Frames stand still: a recording gives each one pose, and the transform of a fram
 Optical frames belong to the raw images; rectification rotates them by the calibration's R, as in ROS's image_proc.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from jaxtyping import Float
 
 from ..camera import StereoCamera
 from ..errors import RecordingError
+from ..toml_kinds import MAX_SHOWN
 from .schemas import CAMERA_FRAMES, WORLD, frame_transform, parse_transform
 
 MAX_STATIC_CHANGE = 1e-6
 """Largest change of a static transform's entries [m, or 1 for a cosine]: the rounding of a robot's messages."""
+
+MAX_FRAMES = 10_000
+"""Most frames of a recording; a robot has a hundred."""
 
 
 class FrameTree:
@@ -23,14 +30,16 @@ class FrameTree:
         self._parents: dict[str, tuple[str, Float[np.ndarray, "4 4"]]] = {}
         self._moving: set[str] = set()
 
-    def add(self, message: FrameTransforms) -> None:
+    def add(self, transforms: Iterable[FrameTransform]) -> None:
         """Add the transforms of one message.
 
         Raises:
             RecordingError: a transform holds NaN, or its quaternion is not of unit length.
         """
-        for transform in message.transforms:
-            child, parent = transform.child_frame_id, transform.parent_frame_id
+        for transform in transforms:
+            child, parent = transform.child_frame_id[:MAX_SHOWN], transform.parent_frame_id[:MAX_SHOWN]
+            if len(self._parents) > MAX_FRAMES:
+                raise RecordingError(f"/tf has more than {MAX_FRAMES} frames.")
             try:
                 T = parse_transform(transform)
             except RecordingError as failure:
@@ -48,7 +57,7 @@ class FrameTree:
         T, name, passed = np.eye(4), frame or WORLD, set()
         while name != WORLD:
             if name not in self._parents or name in passed:
-                raise RecordingError(f"{where}: /tf does not lead from '{WORLD}' to the frame '{frame}'.")
+                raise RecordingError(f"{where}: /tf does not lead from '{WORLD}' to the frame '{frame[:MAX_SHOWN]}'.")
             if name in self._moving:
                 raise RecordingError(
                     f"{where}: the frame '{name}' moves on /tf; only frames that stand still are read."

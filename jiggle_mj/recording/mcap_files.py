@@ -1,8 +1,9 @@
 """MCAP files whose bytes depend on their content alone, and reading them record by record.
 
 A writer flushes the file after each frame, so that a crash loses at most the frame in progress; the reader finds where
-the complete records end. Format: https://mcap.dev/spec. Knows nothing of topics: see `schemas`. Reads front to back
-without the index, as every reader wants the whole file.
+the complete records end. A checksum over everything up to the index, MCAP's own, covers metadata and attachments too.
+Format: https://mcap.dev/spec. Knows nothing of topics: see `schemas`. Reads front to back without the index, as every
+reader wants the whole file.
 """
 
 import io
@@ -20,7 +21,7 @@ import zstandard
 from google.protobuf.message import Message as ProtobufMessage
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from mcap.well_known import MessageEncoding, SchemaEncoding
@@ -28,12 +29,21 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from mcap_protobuf.schema import register_schema
 
 from ..errors import OutputError, RecordingError
+from .chunks import chunk_records
+from .npz_arrays import read_npz
+from .output_files import PartialFile, partial_path
 
 NPZ_MEDIA_TYPE = "application/x-npz"
 RECORD_HEADER = struct.Struct("<BQ")
 """Opcode and length that precede every MCAP record."""
-DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError)
+DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, OverflowError, MemoryError)
 """Exceptions that a damaged record raises: mcap's errors, wrong checksums, wrong lengths, broken compression."""
+MAX_SHOWN = 200
+"""Most characters of a damaged file's content that an error quotes."""
+MAX_RECORD_BYTES = 1 << 30
+"""Largest record [byte]: 1 GiB, four times the largest chunk; attachments may be that large."""
+MAX_TIME_NS = (1 << 63) - 1
+"""Latest time of a message [ns]: signed 64 bits, as numpy and protobuf hold it; the year 2262."""
 
 
 def truth_path(recording: Path) -> Path:
@@ -44,23 +54,18 @@ def truth_path(recording: Path) -> Path:
 class McapOutput:
     """Write messages, metadata and arrays with the caller's times only: the wall clock never enters the file.
 
+    The file gets its name when it is closed; until then it is NAME.part, which no second writer can open.
+
     Raises:
-        OutputError: the path exists and `overwrite` is false, or it cannot be written; any method may raise it.
+        OutputError: the path exists and `overwrite` is false, another process writes it, or it cannot be written; any
+            method may raise it.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         self.path = Path(path)
-        if self.path.is_dir():
-            raise OutputError(f"{self.path} is a folder; give a file, such as {self.path / 'run.mcap'}.")
-        if self.path.exists() and not overwrite:
-            raise OutputError(
-                f"{self.path} exists; choose another path, or allow the file to be replaced (--overwrite)."
-            )
-        try:
-            self._file = open(self.path, "wb")
-        except OSError as failure:
-            raise OutputError(f"{self.path} cannot be written: {failure.strerror}.") from failure
-        self._writer = Writer(self._file)
+        self._output = PartialFile(self.path, overwrite=overwrite)
+        self._file = self._output.file
+        self._writer = Writer(self._file, enable_data_crcs=True)
         with self._writing():
             self._writer.start(profile="")
         self._channels: dict[str, int] = {}
@@ -72,7 +77,11 @@ class McapOutput:
         self.close()
 
     def message(self, topic: str, time: int, message: ProtobufMessage) -> None:
-        """Write a protobuf message at a time [ns] under the schema of its own class."""
+        """Write a protobuf message at a time [ns] under the schema of its own class.
+
+        Raises:
+            ValueError: the time is below 0 or beyond `MAX_TIME_NS`, as in `json`.
+        """
         if topic not in self._channels:
             schema = register_schema(self._writer, type(message))
             self._channels[topic] = self._writer.register_channel(topic, MessageEncoding.Protobuf, schema)
@@ -106,13 +115,15 @@ class McapOutput:
             self._writer.flush()
 
     def close(self) -> None:
-        """Write the index and close the file; a second call does nothing."""
+        """Write the index, close the file and give it its name; a second call does nothing."""
         if not self._file.closed:
             with self._writing():
                 self._writer.finish()
-                self._file.close()
+                self._output.complete()
 
     def _add(self, topic: str, time: int, data: bytes) -> None:
+        if not 0 <= time <= MAX_TIME_NS:
+            raise ValueError(f"a message on {topic} has the time {time} ns; times must be from 0 to {MAX_TIME_NS} ns.")
         with self._writing():
             self._writer.add_message(self._channels[topic], log_time=int(time), publish_time=int(time), data=data)
 
@@ -133,10 +144,9 @@ def read_arrays(attachment: Attachment, path: Path) -> dict[str, np.ndarray]:
         RecordingError: it is not an npz of plain arrays.
     """
     try:
-        with np.load(io.BytesIO(attachment.data), allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError) as failure:
-        raise RecordingError(f"{path}: attachment {attachment.name} is not an npz of arrays ({failure}).") from failure
+        return read_npz(attachment.data)
+    except RecordingError as failure:
+        raise RecordingError(f"{path}: attachment {attachment.name[:40]} {failure}.") from failure
 
 
 def iterate_records(
@@ -154,8 +164,8 @@ def iterate_records(
     path = Path(path)
     try:
         file = open(path, "rb")
-    except OSError as failure:
-        raise RecordingError(f"{path} cannot be read: {failure.strerror}.") from failure
+    except (OSError, ValueError) as failure:
+        raise RecordingError(_unreadable(path, failure)) from failure
     with file:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise RecordingError(f"{path} is not an MCAP file (it does not begin with the magic bytes of MCAP).")
@@ -168,14 +178,30 @@ def iterate_records(
             )
         file.seek(0)
         source = _FirstBytes(file, end)
+        reader = StreamReader(
+            cast(BinaryIO, source), emit_chunks=True, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES
+        )
         try:
-            for record in StreamReader(cast(BinaryIO, source), validate_crcs=True).records:
-                if isinstance(record, Schema | Channel | McapMessage | Metadata | Attachment):
+            for record in reader.records:
+                if isinstance(record, Chunk):
+                    yield from chunk_records(record)
+                elif isinstance(record, Schema | Channel | McapMessage | Metadata | Attachment):
                     yield record
-        except DAMAGE as failure:
+        except (*DAMAGE, RecordingError) as failure:
             if complete or source.remaining or not isinstance(failure, EndOfFile):
-                reason = str(failure) or type(failure).__name__
+                reason = (str(failure) or type(failure).__name__)[:MAX_SHOWN]
                 raise RecordingError(f"{path} is damaged before byte {end - source.remaining}: {reason}.") from failure
+
+
+def _unreadable(path: Path, failure: OSError | ValueError) -> str:
+    """Return why a file cannot be opened, and where an interrupted run left its part."""
+    reason = (failure.strerror if isinstance(failure, OSError) else None) or str(failure)
+    if isinstance(failure, FileNotFoundError) and partial_path(path).exists():
+        return (
+            f"{path} is not complete: its run was interrupted, or still goes on. Read what there is with "
+            f"--allow-truncated from {partial_path(path)}."
+        )
+    return f"{path} cannot be read: {reason}."
 
 
 def _end_of_records(file: BinaryIO) -> tuple[int, bool]:

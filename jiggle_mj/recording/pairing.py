@@ -6,6 +6,11 @@ The sensors of a robot stamp the same instant a few ms apart, hence a tolerance.
 
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
+from itertools import pairwise
+from statistics import median_low
+
+MAX_LEAP_NS = 60_000_000_000
+"""Leap of one time stamp ahead of the next one that is a fault of the stamp [ns]: a minute."""
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
@@ -86,6 +91,44 @@ def group_messages(
 def _latest(messages: list[Stamped], until: int) -> Stamped | None:
     place = bisect_right(messages, until, key=lambda message: message.stamp)
     return messages[place - 1] if place else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StampGap:
+    """How far the right images are from the left ones in time, where none is within the tolerance."""
+
+    median: int
+    """Median of the nearest right image's stamp minus the left image's [ns]."""
+    period: int
+    """Median time between two left images [ns]; 0 for one image."""
+
+    @property
+    def within_frame(self) -> bool:
+        """Return whether each right image is nearer to its left image than to the next one."""
+        return self.period == 0 or 2 * abs(self.median) < self.period
+
+
+def stamp_gap(left: list[Stamped], right: list[Stamped]) -> StampGap:
+    """Return the gap between left images and their nearest right images; there must be some of both."""
+    lefts, rights = sorted(each.stamp for each in left), sorted(each.stamp for each in right)
+    gaps = []
+    for stamp in lefts:
+        place = bisect_left(rights, stamp)
+        gaps.append(min((other - stamp for other in rights[max(0, place - 1) : place + 1]), key=abs))
+    periods = [after - before for before, after in pairwise(lefts)]
+    return StampGap(median=int(median_low(gaps)), period=int(median_low(periods)) if periods else 0)
+
+
+def lone_jumps(stamps: list[int]) -> set[int]:
+    """Return the places of stamps that leap ahead of their neighbours by more than `MAX_LEAP_NS` and alone.
+
+    Without them the stamps before and after still rise, so that one wrong stamp does not cost all frames behind it.
+    """
+    return {
+        place
+        for place in range(1, len(stamps) - 1)
+        if stamps[place - 1] < stamps[place + 1] < stamps[place] - MAX_LEAP_NS
+    }
 
 
 class _Pool:

@@ -4,6 +4,7 @@ The topics are in docs/RECORDINGS.md. A frame that fails a check is named and sk
 interpolate; `contents` says which messages a file may hold, `pairing` which of them belong together.
 """
 
+import math
 import os
 from bisect import bisect_left, bisect_right
 from collections import deque
@@ -22,16 +23,25 @@ from scipy.spatial.transform import Rotation
 from ..camera import StereoCamera
 from ..errors import RecordingError
 from ..observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolReport, ToolState
+from ..toml_kinds import MAX_COUNT
 from .contents import RecordingContents
 from .frames import transform_of_rotation
-from .pairing import MessageGroup, Stamped, group_messages
-from .schemas import decode_image, parse_calibration, parse_points, parse_transform
+from .images import decode_image
+from .pairing import MessageGroup, Stamped, group_messages, lone_jumps, stamp_gap
+from .schemas import parse_calibration, parse_points, parse_transform
+from .stored_arrays import MAX_LENGTH_M, StoredArrays
 from .topics import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO
 
 PAIRING_TOLERANCE_NS = 5_000_000
 """Default largest difference between the stamps of one group [ns]; the sensors of a robot stamp a few ms apart."""
 MAX_POSE_AGE_NS = 100_000_000
 """Default age above which a tool pose no longer says where the tool is [ns]."""
+MAX_SEED_DIGITS = 20
+"""Longest seed that is read: 64 bits."""
+MAX_SPAN_M = 20.0
+"""Largest extent of a cloud [m]: a room. A sheet of 2 cm and more is larger in millimetres."""
+MAX_SD_M = 1.0
+"""Largest standard deviation of a point [m]; a hundredth of it already hides every pull."""
 EQUAL_SD = 1e-6
 """Largest relative difference of two standard deviations that count as one: the rounding of float32."""
 
@@ -67,6 +77,7 @@ class Recording:
             grasp=stamped[GRASP],
             tolerance=tolerance_ns,
         )
+        _refuse_unpaired(contents, self._groups, tolerance_ns)
         self._reader = ObservationReader(
             contents=contents,
             camera=self.camera,
@@ -98,6 +109,12 @@ class Recording:
         contents = RecordingContents(Path(path), allow_truncated=allow_truncated)
         return cls(contents, tolerance_ns=tolerance_ns, pose_age_ns=pose_age_ns)
 
+    @property
+    def seed(self) -> int | None:
+        """Return the seed that the metadata state; None where they state none, as a secret scene's."""
+        text = self.metadata.get("seed", "")
+        return int(text) if text.isascii() and text.isdigit() and len(text) <= MAX_SEED_DIGITS else None
+
     def __len__(self) -> int:
         """Return the number of frames, unusable ones included."""
         return len(self._groups)
@@ -108,8 +125,11 @@ class Recording:
         latest: int | None = None
         last_pose: Stamped | None = None
         coming = deque(self._contents.events)
+        jumps = lone_jumps([group.stamp for group in self._groups])
         for index, (group, messages) in enumerate(self._grouped_messages()):
             try:
+                if index in jumps:
+                    raise RecordingError(f"its time leaps to {group.stamp} ns, and the next frame's back")
                 if latest is not None and group.stamp <= latest:
                     raise RecordingError(f"time goes backwards, from {latest} ns to {group.stamp} ns")
                 latest = group.stamp
@@ -206,16 +226,19 @@ class ObservationReader:
         return StereoPair(left=decoded[0], right=decoded[1])
 
     def _points(self, message: PointCloud) -> MeasuredPoints:
-        columns = parse_points(message, POINTS)
+        columns = StoredArrays(parse_points(message, POINTS), POINTS)
         T = self.contents.frames.T_world(message.frame_id, POINTS) @ parse_transform(message.pose)
-        positions = np.column_stack([columns[name].astype(float) for name in "xyz"])
+        positions = np.column_stack([columns.numbers(name, (None,)) for name in "xyz"])
         positions[~np.isfinite(positions).all(axis=1)] = np.nan
+        _refuse_span(positions)
         if not np.array_equal(T, np.eye(4)):
             positions = positions @ T[:3, :3].T + T[:3, 3]
         known = {}
         if "sd" in columns and len(positions):
-            known["sd"] = _common_sd(columns["sd"].astype(float))
-        track = columns["track_id"].astype(np.int64) if "track_id" in columns else None
+            known["sd"] = _common_sd(columns.numbers("sd", (None,)))
+        track = None
+        if "track_id" in columns:
+            track = columns.indices("track_id", (None,), from_=-MAX_COUNT, below=MAX_COUNT)
         return MeasuredPoints(positions=positions, track_id=track, **known)
 
     def _T_world_tip(self, pose: PoseInFrame) -> Float[np.ndarray, "4 4"]:
@@ -243,6 +266,26 @@ def _parts(group: MessageGroup) -> list[tuple[str, Stamped]]:
     return [(topic, message) for topic, message in parts if message is not None]
 
 
+def _refuse_unpaired(contents: RecordingContents, groups: list[MessageGroup], tolerance_ns: int) -> None:
+    """Refuse a recording in which no left image has a right one, and say how far apart they are."""
+    left, right = contents.stamped[LEFT], contents.stamped[RIGHT]
+    if not left or not right or any(group.left is not None and group.right is not None for group in groups):
+        return
+    gap = stamp_gap(left, right)
+    apart, side = abs(gap.median) / 1e6, "later" if gap.median > 0 else "earlier"
+    if gap.within_frame:
+        cure = (
+            f"if the cameras do fire together, read it with --pairing-tolerance {math.ceil(apart) + 1} "
+            f"(tolerance_ns={math.ceil(apart) + 1}_000_000)"
+        )
+    else:
+        cure = f"left images come every {gap.period / 1e6:g} ms: are the two stamps of one clock?"
+    raise RecordingError(
+        f"{contents.path} has {len(left)} left and {len(right)} right images and no pair within "
+        f"{tolerance_ns / 1e6:g} ms: the nearest right image comes {apart:.6g} ms {side} (median); {cure}."
+    )
+
+
 def _read_camera(contents: RecordingContents) -> StereoCamera:
     left, right = contents.calibrations[LEFT_INFO], contents.calibrations[RIGHT_INFO]
     calibration = parse_calibration(left, LEFT_INFO)
@@ -254,10 +297,27 @@ def _read_camera(contents: RecordingContents) -> StereoCamera:
     )
 
 
+def _refuse_span(positions: Float[np.ndarray, "m 3"]) -> None:
+    """Refuse a cloud that is larger than any sheet or scene; it is the likeliest one in millimetres."""
+    seen = positions[~np.isnan(positions[:, 0])]
+    if len(seen) and (np.abs(seen) > MAX_LENGTH_M).any():
+        raise RecordingError(f"{POINTS} has a point beyond {MAX_LENGTH_M:g} m")
+    span = float(np.ptp(seen, axis=0).max()) if len(seen) else 0.0
+    if span > MAX_SPAN_M:
+        raise RecordingError(
+            f"{POINTS} spans {span:.4g} m; PointCloud is in metres, and at most {MAX_SPAN_M:g} m are read (is it in "
+            f"millimetres? then it spans {span / 1e3:.4g} m)"
+        )
+
+
 def _common_sd(sd: Float[np.ndarray, " m"]) -> float:
     """Return the standard deviation that all points of a cloud share [m]; refuse two different ones."""
     finite = sd[np.isfinite(sd)]
     low, high = (finite.min(), finite.max()) if len(finite) else (np.nan, np.nan)
     if high > low * (1 + EQUAL_SD):
         raise RecordingError(f"{POINTS} has sd from {low:g} to {high:g} m; all points of a cloud must share one.")
+    if low > MAX_SD_M:
+        raise RecordingError(
+            f"{POINTS} has an sd of {low:g} m; at most {MAX_SD_M:g} m are read (is it in millimetres?)"
+        )
     return float(low)

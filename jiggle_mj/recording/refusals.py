@@ -6,6 +6,9 @@ from pathlib import Path
 from ..errors import RecordingError
 from .topics import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO
 
+MAX_LISTED = 500
+"""Most characters of topics that a message lists: those of a robot, shortened only where a name is absurd."""
+
 
 def refuse_truth(path: Path, topic: str) -> None:
     """Refuse a file for one of its topics.
@@ -33,8 +36,7 @@ def refuse_incomplete(path: Path, present: set[str], ignored: Collection[str]) -
     sensors = f"{POINTS} or the pair {LEFT}, {RIGHT}"
     if not present:
         raise RecordingError(
-            f"{path} is foreign: it needs {POSE}, {GRASP} and {sensors}; "
-            f"its topics are: {', '.join(ignored) or 'none'}."
+            f"{path} is foreign: it needs {POSE}, {GRASP} and {sensors}; its topics are: {_listed(ignored)}."
         )
     missing = [topic for topic in (POSE, GRASP) if topic not in present]
     if (LEFT in present) != (RIGHT in present):
@@ -43,8 +45,14 @@ def refuse_incomplete(path: Path, present: set[str], ignored: Collection[str]) -
         missing.append(sensors)
     if missing:
         raise RecordingError(
-            f"{path} lacks {' and '.join(missing)}; its topics are: {', '.join(sorted(present | set(ignored)))}."
+            f"{path} lacks {' and '.join(missing)}; its topics are: {_listed(present | set(ignored))}."
         )
     uncalibrated = [topic for topic in (LEFT_INFO, RIGHT_INFO) if topic not in present]
     if has_images and uncalibrated:
         raise RecordingError(f"{path} has images but no calibration: it lacks {' and '.join(uncalibrated)}.")
+
+
+def _listed(topics: Collection[str]) -> str:
+    """Return names of topics for a message, in the order of names, as far as there is room."""
+    names = ", ".join(sorted(topics)) or "none"
+    return names if len(names) <= MAX_LISTED else f"{names[:MAX_LISTED]}..., {len(topics)} in all"

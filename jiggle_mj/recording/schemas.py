@@ -4,7 +4,6 @@ Schemas: https://docs.foxglove.dev/docs/sdk/schemas. Orientations are wxyz here;
 order is assumed. Knows nothing of files or of which messages belong together: see `mcap_files`, `pairing`.
 """
 
-import json
 from typing import Any
 
 import cv2
@@ -16,13 +15,17 @@ from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.timestamp_pb2 import Timestamp
 from jaxtyping import Float, UInt8
 
 from ..camera import CameraCalibration, matrix_from_quaternion, rounded_quaternion
 from ..errors import RecordingError
 from ..observation import IDENTITY_WXYZ, ToolState
+from ..toml_kinds import MAX_SHOWN, flag, integer, not_negative
+from .images import MAX_PIXELS
+from .json_values import entry, parse_object
+from .stored_arrays import MAX_LENGTH_M
+from .topics import GRASP
 
 WORLD = "world"
 """Name of the world frame."""
@@ -34,8 +37,14 @@ DISTORTION_COEFFICIENTS = (0, 4, 5, 8)
 """Lengths of D that `plumb_bob` (up to 5) and `rational_polynomial` (8) have."""
 UNIT_LENGTH = 0.01
 """Largest difference of a quaternion's length from 1: a robot's rounding."""
-SHOWN_BYTES = 80
-"""How much of a malformed message an error shows."""
+MAX_POINTS = 2_000_000
+"""Most points of a cloud: twice those of a depth camera; the estimator takes far fewer."""
+MAX_POINT_BYTES = 1 << 12
+"""Most bytes of a point; a scanner's has fewer than 100."""
+MAX_DISTORTION = 1e4
+"""Largest distortion coefficient; those of real lenses are below 100."""
+MAX_FOCAL_PX = 1e6
+"""Largest focal length and principal point [px]; beyond it the view is narrower than the noise of its direction."""
 NS_PER_S = 1_000_000_000
 """Nanoseconds in a second."""
 
@@ -70,9 +79,6 @@ FIELD_TYPES: dict[str, "PackedElementField.NumericType.ValueType"] = {
 FIELD_FORMATS = {number: name for name, number in FIELD_TYPES.items()}
 """The types of PointCloud to numpy's."""
 
-RAW_ENCODINGS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "8UC3": 3, "8UC1": 1}
-"""Encodings of RawImage that are read, and their number of channels; 8UC3 is BGR, as Foxglove reads it."""
-
 
 def timestamp(time: int) -> Timestamp:
     """Return the protobuf timestamp of a time [ns]."""
@@ -91,31 +97,6 @@ def image_message(time: int, image: UInt8[np.ndarray, "height width 3"], side: s
     if not encoded:
         raise ValueError(f"an image of shape {image.shape} cannot be written as png.")
     return CompressedImage(timestamp=timestamp(time), frame_id=CAMERA_FRAMES[side], data=data.tobytes(), format="png")
-
-
-def decode_image(message: CompressedImage | RawImage) -> UInt8[np.ndarray, "height width 3"]:
-    """Return the RGB image of a message.
-
-    Raises:
-        RecordingError: the data cannot be decoded, or the encoding is not one of `RAW_ENCODINGS`.
-    """
-    if isinstance(message, CompressedImage):
-        data = np.frombuffer(message.data, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-        if image is None:
-            raise RecordingError(f"cannot be decoded as {message.format or 'png'} ({data.size} bytes)")
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    if message.encoding not in RAW_ENCODINGS:
-        raise RecordingError(f"has encoding '{message.encoding}'; {', '.join(RAW_ENCODINGS)} are read")
-    channels = RAW_ENCODINGS[message.encoding]
-    data, step = np.frombuffer(message.data, np.uint8), message.step or message.width * channels
-    if step < message.width * channels or data.size < step * message.height or not data.size:
-        raise RecordingError(f"has {data.size} bytes; {message.width}x{message.height} at {step} a row need more")
-    rows = data[: step * message.height].reshape(message.height, step)[:, : message.width * channels]
-    image = rows.reshape(message.height, message.width, channels)
-    if channels == 1:
-        return np.repeat(image, 3, axis=2)
-    return image.copy() if message.encoding == "rgb8" else image[..., ::-1].copy()
 
 
 def calibration_message(calibration: CameraCalibration, side: str) -> CalibrationMessage:
@@ -147,9 +128,8 @@ def parse_calibration(message: CalibrationMessage, topic: str) -> CameraCalibrat
         RecordingError: uncalibrated, a fisheye model, or matrices of the wrong length.
     """
     if message.distortion_model not in ("", "plumb_bob", "rational_polynomial"):
-        raise RecordingError(
-            f"{topic} has distortion model '{message.distortion_model}'; plumb_bob and rational_polynomial are read."
-        )
+        model = message.distortion_model[:MAX_SHOWN]
+        raise RecordingError(f"{topic} has distortion model '{model}'; plumb_bob and rational_polynomial are read.")
     K, R, P = (np.array(values, float) for values in (message.K, message.R, message.P))
     R = R if R.any() else np.eye(3).ravel()
     if (len(K), len(R), len(P)) != (9, 9, 12) or not (K[0] > 0 and P[0] > 0):
@@ -157,15 +137,30 @@ def parse_calibration(message: CalibrationMessage, topic: str) -> CameraCalibrat
             f"{topic} is not calibrated: it needs K of 9, P of 12 numbers and fx > 0; "
             f"got {len(K)}, {len(P)} and K[0] = {K[0] if len(K) else None}."
         )
-    numbers = np.concatenate([K, R, P, np.array(message.D, float)])
-    if not np.isfinite(numbers).all():
+    D = np.array(message.D, float)
+    if len(D) not in DISTORTION_COEFFICIENTS:
+        raise RecordingError(f"{topic} has {len(D)} distortion coefficients; 0, 4, 5 or 8 are read.")
+    if not np.isfinite(np.concatenate([K, R, P, D])).all():
         raise RecordingError(f"{topic} holds numbers that are not finite.")
+    if (np.abs(D) > MAX_DISTORTION).any() or (np.abs(np.concatenate([K, P])) > MAX_FOCAL_PX).any():
+        raise RecordingError(
+            f"{topic} holds numbers beyond those of a camera: D up to {MAX_DISTORTION:g}, K and P up to "
+            f"{MAX_FOCAL_PX:g} px are read."
+        )
+    if not np.allclose(R.reshape(3, 3) @ R.reshape(3, 3).T, np.eye(3), rtol=0, atol=UNIT_LENGTH):
+        raise RecordingError(f"{topic} has an R that is no rotation.")
+    if not (K[4] > 0 and P[5] > 0 and K[8] == 1 and P[10] == 1):
+        raise RecordingError(f"{topic} has no pinhole matrices: K[4], P[5] must be above 0, K[8] and P[10] must be 1.")
+    if not 0 < message.width * message.height <= MAX_PIXELS:
+        raise RecordingError(
+            f"{topic} is of a camera of {message.width}x{message.height}; 1 to {MAX_PIXELS} pixels are read."
+        )
     return CameraCalibration(
         width=message.width,
         height=message.height,
         K=K.reshape(3, 3),
         P=P.reshape(3, 4),
-        D=np.array(message.D, float),
+        D=D,
         R=R.reshape(3, 3),
     )
 
@@ -201,11 +196,14 @@ def refuse_bad_pose(position: Float[np.ndarray, " 3"], quat_wxyz: Float[np.ndarr
     """Refuse a malformed pose.
 
     Raises:
-        RecordingError: NaN or infinity, or a quaternion whose length differs from 1 by more than `UNIT_LENGTH`.
+        RecordingError: NaN or infinity, a position beyond `MAX_LENGTH_M`, or a quaternion whose length differs from 1
+            by more than `UNIT_LENGTH`.
     """
+    if np.isfinite(position).all() and (np.abs(position) > MAX_LENGTH_M).any():
+        raise RecordingError(f"the pose's position {position.tolist()} is beyond {MAX_LENGTH_M:g} m")
     if not (np.isfinite(position).all() and np.isfinite(quat_wxyz).all()):
         raise RecordingError(f"NaN in the pose: position {position.tolist()}, quaternion wxyz {quat_wxyz.tolist()}")
-    if abs(np.linalg.norm(quat_wxyz) - 1) > UNIT_LENGTH:
+    if (np.abs(quat_wxyz) > 1 + UNIT_LENGTH).any() or abs(np.linalg.norm(quat_wxyz) - 1) > UNIT_LENGTH:
         raise RecordingError(f"the pose's quaternion wxyz {quat_wxyz.tolist()} is not of unit length")
 
 
@@ -234,21 +232,34 @@ def parse_grasp(data: bytes) -> dict[str, Any]:
         RecordingError: not JSON, or a field missing or of the wrong kind.
     """
     try:
-        value = json.loads(data)
-        if not isinstance(value["closed"], bool):
-            raise TypeError("closed is not true or false")
+        value = parse_object(data, GRASP)
         return {
-            "closed": value["closed"],
-            "grasp": int(value["grasp"]),
-            "radius": float(value["radius"]),
-            "held_tracks": tuple(int(track) for track in value.get("held_tracks", ())),
-            "by_points": bool(value.get("by_points", False)),
+            "closed": entry(value, "closed", flag, GRASP),
+            "grasp": entry(value, "grasp", _grasp_number, GRASP),
+            "radius": entry(value, "radius", not_negative, GRASP),
+            "held_tracks": entry(value, "held_tracks", _tracks, GRASP, ()),
+            "by_points": entry(value, "by_points", flag, GRASP, False),
         }
-    except (KeyError, TypeError, ValueError) as failure:
+    except RecordingError as failure:
         raise RecordingError(
-            "/tool/grasp must be JSON {closed, grasp, radius}, and held_tracks and by_points where they are known; "
-            f"got {data[:SHOWN_BYTES]!r} ({failure!r})."
+            f"{GRASP} must be JSON {{closed, grasp, radius}}, and held_tracks and by_points where they are known; "
+            f"{failure}"
         ) from failure
+
+
+def _grasp_number(value: Any) -> int:
+    """Return the number of a grasp."""
+    grasp = integer(value)
+    if grasp < 0:
+        raise TypeError("a whole number from 0")
+    return grasp
+
+
+def _tracks(value: Any) -> tuple[int, ...]:
+    """Return a list of track ids."""
+    if not isinstance(value, list) or len(value) > MAX_POINTS:
+        raise TypeError("a list of whole numbers")
+    return tuple(integer(track) for track in value)
 
 
 def point_cloud(time: int, columns: dict[str, np.ndarray], *, frame_id: str = WORLD) -> PointCloud:
@@ -275,9 +286,15 @@ def parse_points(message: PointCloud, topic: str) -> dict[str, np.ndarray]:
     known = {f.name: (FIELD_FORMATS[f.type], f.offset) for f in message.fields if f.type in FIELD_FORMATS}
     missing = [name for name in "xyz" if name not in known]
     if missing:
-        raise RecordingError(f"{topic} lacks the fields {missing}; it has {sorted(f.name for f in message.fields)}.")
+        names = str(sorted(f.name for f in message.fields))[:MAX_SHOWN]
+        raise RecordingError(f"{topic} lacks the fields {missing}; it has {names}.")
     stride = message.point_stride
     ends = [offset + np.dtype(form).itemsize for form, offset in known.values()]
+    if stride > MAX_POINT_BYTES or len(message.data) > MAX_POINTS * stride:
+        raise RecordingError(
+            f"{topic} has {len(message.data)} bytes of data for points of {stride} bytes; at most {MAX_POINTS} points "
+            f"of {MAX_POINT_BYTES} bytes are read."
+        )
     if stride == 0 or max(ends) > stride or len(message.data) % stride:
         raise RecordingError(f"{topic} has {len(message.data)} bytes of data for points of {stride} bytes.")
     layout = np.dtype(
@@ -288,7 +305,7 @@ def parse_points(message: PointCloud, topic: str) -> dict[str, np.ndarray]:
             "itemsize": stride,
         }
     )
-    table = np.frombuffer(message.data, layout)
+    table = np.frombuffer(message.data, layout) if message.data else np.empty(0, layout)
     return {name: table[name].copy() for name in known}
 
 

@@ -13,13 +13,17 @@ import numpy as np
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from jaxtyping import Bool, Float, Int
-from mcap.records import Attachment, Channel, Message, Metadata
+from mcap.records import Message
 
 from ..errors import RecordingError
+from ..toml_kinds import count, text
 from ..truth import Truth, TruthFrame
 from .declaration import METADATA, file_metadata
-from .mcap_files import McapOutput, iterate_records, read_arrays
+from .json_values import entry, parse_object
+from .mcap_files import McapOutput, read_arrays
+from .messages import checked_stamp, parse_message, read_messages, refuse_disorder
 from .schemas import WORLD, fill_pose, parse_points, point_cloud, timestamp
+from .stored_arrays import StoredArrays
 
 TRUTH_REST, TRUTH_POINTS, TRUTH_TOOL, TRUTH_FRAME = "/truth/rest", "/truth/points", "/truth/tool", "/truth/frame"
 """Topics."""
@@ -43,6 +47,7 @@ class TruthWriter:
         attached: which vertices are attached at the start.
         scene: name of the scene or recording.
         identity: identity of the recording, as its metadata has it.
+        salt: random text that went into the identity of a secret scene; empty for others.
         details: further entries, JSON-serialisable.
         overwrite: replace an existing file.
 
@@ -60,9 +65,10 @@ class TruthWriter:
         scene: str,
         details: dict[str, object],
         identity: str = "",
+        salt: str = "",
         overwrite: bool = False,
     ) -> None:
-        self._origin = {"scene": scene, "identity": identity}
+        self._origin = {"scene": scene, "identity": identity} | ({"salt": salt} if salt else {})
         self._output = McapOutput(path, overwrite=overwrite)
         self._output.metadata(METADATA, file_metadata())
         self.conclude(details)
@@ -127,46 +133,66 @@ def read_truth(path: str | os.PathLike[str], *, allow_truncated: bool = False) -
         RecordingError: missing, not an MCAP, truncated, damaged, or not a truth file.
     """
     path = Path(path)
-    topics: dict[int, str] = {}
-    messages: dict[str, list[Message]] = {TRUTH_REST: [], TRUTH_POINTS: [], TRUTH_TOOL: [], TRUTH_FRAME: []}
-    faces, origin = None, {}
-    for record in iterate_records(path, allow_truncated=allow_truncated):
-        if isinstance(record, Channel):
-            topics[record.id] = record.topic
-        elif isinstance(record, Message) and topics[record.channel_id] in messages:
-            messages[topics[record.channel_id]].append(record)
-        elif isinstance(record, Attachment) and record.name == FACES:
-            faces = read_arrays(record, path)["faces"]
-        elif isinstance(record, Metadata) and record.name == DETAILS:
-            origin = record.metadata
-    if not messages[TRUTH_REST] or faces is None or not origin:
-        names = ", ".join(sorted(set(topics.values()))) or "none"
-        raise RecordingError(f"{path} is not a truth file: it needs {TRUTH_REST} and {FACES}; its topics are: {names}.")
-    rest = parse_points(PointCloud.FromString(messages[TRUTH_REST][0].data), TRUTH_REST)
-    frames = zip(messages[TRUTH_POINTS], messages[TRUTH_TOOL], messages[TRUTH_FRAME], strict=False)
+    content = read_messages(path, (TRUTH_REST, TRUTH_POINTS, TRUTH_TOOL, TRUTH_FRAME), allow_truncated=allow_truncated)
+    origin = content.metadata.get(DETAILS, {})
+    if not content.messages[TRUTH_REST] or FACES not in content.attachments or not origin:
+        raise RecordingError(
+            f"{path} is not a truth file: it needs {TRUTH_REST} and {FACES}; its topics are: {content.topics}."
+        )
+    rest = _columns(content.messages[TRUTH_REST][0], TRUTH_REST, path)
+    positions = _positions(rest, None, finite=True)
+    n = len(positions)
+    if n == 0:
+        raise RecordingError(f"{path} is damaged: {TRUTH_REST} has no vertices.")
+    frames = tuple(
+        _parse_frame(*frame, n, path)
+        for frame in content.frames(TRUTH_POINTS, TRUTH_TOOL, TRUTH_FRAME, complete=not allow_truncated)
+    )
+    refuse_disorder(frames, path)
+    where = f"{path}: {DETAILS}"
     return Truth(
-        rest=_positions(rest),
-        faces=faces,
-        attached=rest["attached"].astype(bool),
-        frames=tuple(_parse_frame(*frame) for frame in frames),
-        scene=origin["scene"],
+        rest=positions,
+        faces=StoredArrays(read_arrays(content.attachments[FACES], path), f"{path}: {FACES}").indices(
+            "faces", (None, 3), below=n
+        ),
+        attached=rest.flags("attached", (n,)),
+        frames=frames,
+        scene=entry(origin, "scene", text, where),
         identity=origin.get("identity", ""),
-        details=json.loads(origin["details"]),
+        details=parse_object(entry(origin, "details", text, where), where),
     )
 
 
-def _parse_frame(points: Message, tool: Message, frame: Message) -> TruthFrame:
-    columns = parse_points(PointCloud.FromString(points.data), TRUTH_POINTS)
-    tip = PoseInFrame.FromString(tool.data).pose.position
+def salt(path: Path) -> str:
+    """Return the salt of the identity that a truth file states; empty where it states none.
+
+    Raises:
+        RecordingError: missing, not an MCAP, truncated, damaged.
+    """
+    return read_messages(path, (), allow_truncated=True).metadata.get(DETAILS, {}).get("salt", "")
+
+
+def _parse_frame(points: Message, tool: Message, frame: Message, n: int, path: Path) -> TruthFrame:
+    columns = _columns(points, TRUTH_POINTS, path)
+    tip = parse_message(PoseInFrame, tool.data, f"{path}: {TRUTH_TOOL}").pose.position
+    where = f"{path}: {TRUTH_FRAME}"
+    stiffness = columns.numbers("stiffness", (n,))
+    if (stiffness < 0).any():
+        raise RecordingError(f"{path}: {TRUTH_POINTS} has a stiffness below 0: {np.nanmin(stiffness):.3g} N/m.")
     return TruthFrame(
-        index=json.loads(frame.data)["index"],
-        time=points.log_time,
-        positions=_positions(columns),
-        stiffness=columns["stiffness"],
+        index=entry(parse_object(frame.data, where), "index", count, where),
+        time=checked_stamp(points.log_time, TRUTH_POINTS),
+        positions=_positions(columns, n),
+        stiffness=stiffness,
         tip=np.array([tip.x, tip.y, tip.z]),
-        load=columns.get("load"),
+        load=columns.numbers("load", (n,)) if "load" in columns else None,
     )
 
 
-def _positions(columns: dict[str, np.ndarray]) -> Float[np.ndarray, "n 3"]:
-    return np.column_stack([columns[name] for name in "xyz"])
+def _columns(message: Message, topic: str, path: Path) -> StoredArrays:
+    where = f"{path}: {topic}"
+    return StoredArrays(parse_points(parse_message(PointCloud, message.data, where), where), where)
+
+
+def _positions(columns: StoredArrays, n: int | None, *, finite: bool = False) -> Float[np.ndarray, "n 3"]:
+    return np.column_stack([columns.positions(name, (n,), finite=finite) for name in "xyz"])

@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 from difflib import get_close_matches
 
 from jiggle_mj.errors import SceneError
+from jiggle_mj.toml_kinds import MAX_SHOWN, shown
 
 from ..scene.disturbance import Disturbance
 from ..scene.scene import Scene
@@ -78,9 +79,9 @@ def disturbance_class(name: object) -> type[Disturbance]:
     if name is None:
         raise SceneError('a disturbance lacks its name; write for example name = "gravity".')
     if not isinstance(name, str) or name not in DISTURBANCES:
-        near = get_close_matches(str(name), DISTURBANCES, n=1)
+        near = get_close_matches(str(name)[:MAX_SHOWN], DISTURBANCES, n=1)
         hint = f"; did you mean {near[0]}?" if near else ";"
-        raise SceneError(f"no disturbance named {name!r}{hint} There are {', '.join(DISTURBANCES)}.")
+        raise SceneError(f"no disturbance named {shown(name)}{hint} There are {', '.join(DISTURBANCES)}.")
     return DISTURBANCES[name]
 
 

@@ -254,7 +254,7 @@ class Scene:
                 f"tissue.spacing = {self.tissue.spacing}: must be at most a quarter of the shorter side, "
                 f"{min(self.tissue.size) / 4:g} m."
             )
-        n = self.tissue.size[0] * self.tissue.size[1] / (math.sqrt(0.75) * self.tissue.spacing**2)
+        n = self.tissue.size[0] / self.tissue.spacing * self.tissue.size[1] / self.tissue.spacing / math.sqrt(0.75)
         if n > MAX_VERTICES:
             raise SceneError(
                 f"tissue.spacing = {self.tissue.spacing} m on {self.tissue.size[0]:g} by {self.tissue.size[1]:g} m "

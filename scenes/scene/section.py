@@ -10,15 +10,18 @@ from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, ClassVar
 
 from jiggle_mj.errors import SceneError
+from jiggle_mj.toml_kinds import number as number_of
+from jiggle_mj.toml_kinds import shown
 
 Check = Callable[[object], Any]
 """Function that returns the value in its stored type, or raises ValueError with what is allowed."""
 
 
 def _real(value: object, allowed: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(allowed)
-    return float(value)
+    try:
+        return number_of(value)
+    except TypeError:
+        raise ValueError(allowed) from None
 
 
 def _field(check: Check, default: object) -> Any:
@@ -171,4 +174,4 @@ def checked(f: Field[Any], value: object, *, where: str) -> Any:
     try:
         return f.metadata["check"](value)
     except ValueError as error:
-        raise SceneError(f"{where}.{f.name} = {value!r}: must be {error}.") from None
+        raise SceneError(f"{where}.{f.name} = {shown(value)}: must be {error}.") from None

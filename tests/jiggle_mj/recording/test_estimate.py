@@ -104,7 +104,7 @@ def test_an_unfinished_estimate_has_no_belief(tmp_path):
     crashed = tmp_path / "crashed.mcap"
     with EstimateWriter(tmp_path / "estimate.mcap", sheet(), {}) as writer:
         writer.write(estimate(0))
-        crashed.write_bytes((tmp_path / "estimate.mcap").read_bytes())
+        crashed.write_bytes((tmp_path / "estimate.mcap.part").read_bytes())
     with pytest.raises(RecordingError, match="truncated"):
         read_estimate(crashed)
     for read in (read_estimate(crashed, allow_truncated=True), read_estimate(tmp_path / "estimate.mcap")):

@@ -71,7 +71,7 @@ def test_a_file_without_a_needed_topic_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("{", "cannot be read"),
+        ("{", "is not JSON"),
         ('{"youngs": 3.0}', "youngs"),
         ('{"poisson": 0.5}', r"poisson must be in \[0, 0\.5\)"),
     ],

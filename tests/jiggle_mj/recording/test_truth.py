@@ -32,7 +32,7 @@ def test_a_crash_leaves_the_truth_so_far(tmp_path):
     named = {name: getattr(given, name) for name in ("rest", "faces", "attached", "scene", "details")}
     with TruthWriter(tmp_path / "run.truth.mcap", **named) as writer:
         writer.write(given.frames[0])
-        crashed.write_bytes((tmp_path / "run.truth.mcap").read_bytes())
+        crashed.write_bytes((tmp_path / "run.truth.mcap.part").read_bytes())
     with pytest.raises(RecordingError, match="truncated"):
         read_truth(crashed)
     assert len(read_truth(crashed, allow_truncated=True).frames) == 1

@@ -1,0 +1,69 @@
+"""JSON objects from files of unknown origin: every key has a kind, as in `toml_kinds`; nothing else gets through."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from ..errors import RecordingError
+from ..toml_kinds import REQUIRED, shown
+
+MAX_JSON_BYTES = 1 << 26
+"""Longest JSON text that is read [byte]: 64 MiB, some thousand times a usual one."""
+
+
+def parse_object(data: bytes | str, where: str) -> dict[str, Any]:
+    """Return the JSON object in a text.
+
+    Args:
+        data: the text.
+        where: what it is, for messages.
+
+    Raises:
+        RecordingError: no JSON, NaN or Infinity in it, nested too deeply, too long, or no object.
+    """
+    if len(data) > MAX_JSON_BYTES:
+        raise RecordingError(f"{where} is JSON of {len(data)} bytes; at most {MAX_JSON_BYTES} are read.")
+    try:
+        value = json.loads(data, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as failure:
+        raise RecordingError(f"{where} is not JSON ({failure}): {shown(data)}") from failure
+    if not isinstance(value, dict):
+        raise RecordingError(f"{where} is JSON, but no object {{...}}: {shown(data)}")
+    return value
+
+
+def entry(values: dict[str, Any], key: str, kind: Callable[[Any], Any], where: str, default: Any = REQUIRED) -> Any:
+    """Return the value of a key, or the default where the key is missing.
+
+    Raises:
+        RecordingError: the key is missing without a default, or its value is not of that kind.
+    """
+    if key not in values:
+        if default is REQUIRED:
+            raise RecordingError(f"{where} lacks '{key}'; it has {shown(list(values))}.")
+        return default
+    try:
+        return kind(values[key])
+    except TypeError as failure:
+        raise RecordingError(f"{where} has {key} = {shown(values[key])}; it must be {failure}.") from failure
+
+
+def parse_list(text: str, kind: Callable[[Any], Any], where: str) -> list[Any]:
+    """Return the JSON list in a text, each item of a kind.
+
+    Raises:
+        RecordingError: no JSON list, or an item of another kind.
+    """
+    items = parse_object(f'{{"items": {text}}}', where)["items"]
+    if not isinstance(items, list):
+        raise RecordingError(f"{where} must be a JSON list; got {shown(text)}.")
+    return [entry({"item": item}, "item", kind, where) for item in items]
+
+
+def optional(kind: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return the kind that also allows null."""
+    return lambda value: None if value is None else kind(value)
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON")
