@@ -10,7 +10,8 @@ from ..allocator import keep_freed_memory
 from ..errors import JiggleError, OptionError, OutputError, SceneError
 from .checks import bench, doctor, scene_check
 from .estimating import close_loop, estimate, identify, run, score
-from .recording import import_, record
+from .importing import import_, inspect
+from .recording import record
 from .tables import table
 from .terminal import FAILED, INTERRUPTED, WRONG_USAGE, stop
 
@@ -18,6 +19,7 @@ VERBS = {
     "run": run,
     "record": record,
     "import": import_,
+    "inspect": inspect,
     "estimate": estimate,
     "identify": identify,
     "close-loop": close_loop,

@@ -1,8 +1,7 @@
-"""The verbs `record` and `import`, which make recordings."""
+"""The verb `record`, which makes recordings of the simulated reference."""
 
 import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +9,7 @@ import tyro
 
 from ..errors import OptionError
 from ..options import Sensing
-from .options import AsJson, Disturb, Name, Out, PathArgument
+from .options import AsJson, Disturb, Name, Out
 from .terminal import FAILED, INTERRUPTED, bar, console, progress, stop
 
 if TYPE_CHECKING:
@@ -136,40 +135,3 @@ def _record_series(
         print(json.dumps({"folder": str(folder), "recordings": [*map(str, series.recordings)], "failed": failed}))
     if series.failed:
         sys.exit(FAILED)
-
-
-def import_(
-    folder: PathArgument,
-    /,
-    *,
-    out: Out,
-    recording: Path | None = None,
-    overwrite: bool = False,
-    allow_outside: bool = False,
-    as_json: AsJson = False,
-) -> None:
-    """Convert a folder of measured points to a recording.
-
-    A recording.toml describes the data: docs/RECORDINGS.md has its keys.
-
-    Args:
-        folder: folder of the data files.
-        out: the recording to write; attachments that the TOML knows go to a separate truth file beside it.
-        recording: the recording.toml; that of the folder if left out.
-        overwrite: replace existing files.
-        allow_outside: read data files outside the folder where the TOML names them.
-        as_json: print a summary to stdout as JSON.
-    """
-    from ..importing.folder import import_folder
-
-    summary = import_folder(folder, recording, out, overwrite=overwrite, allow_outside=allow_outside)
-    for note in summary.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
-    for name, why in summary.skipped:
-        console.print(f"left out {name}: {why}")
-    console.print(
-        f"wrote {summary.recording}: {summary.n_frames} frames of {summary.n_points} points, {summary.n_unseen} "
-        f"missing points over all frames, {summary.n_held} held; truth: {summary.truth or 'none'}"
-    )
-    if as_json:
-        print(json.dumps(asdict(summary), default=str))

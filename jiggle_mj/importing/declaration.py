@@ -171,7 +171,7 @@ def _recording(top: StrictTable) -> MeasuredRecording:
         grasp=_grasp(grasp),
         attached=_attached(truth),
         truth_details=dict(truth.take("details", kinds.table, {})),
-        declaration=_declaration(top.table("declaration", optional=True)),
+        declaration=parse_declaration_table(top.table("declaration", optional=True)),
     )
     for table in (mesh, extend, grasp, truth, top):
         table.refuse_unknown()
@@ -248,7 +248,12 @@ def _rows(table: StrictTable, name: str) -> Rows | None:
     return None if rows is None and file is None else Rows(rows=tuple(rows or ()), file=file, first=first)
 
 
-def _declaration(table: StrictTable) -> Declaration:
+def parse_declaration_table(table: StrictTable) -> Declaration:
+    """Return the declaration in a `[declaration]` table.
+
+    Raises:
+        RecordingError: an unknown key, a value of the wrong kind, or one that `Declaration` refuses.
+    """
     allowed: dict[str, Callable[[Any], Any]] = {f.name: kinds.number for f in fields(Declaration) if f.name != "mesh"}
     allowed |= {"gravity": kinds.vector, "bed": kinds.flag}
     values = {name: table.take(name, kind) for name, kind in allowed.items() if name in table.values}

@@ -14,6 +14,8 @@ LEFT, RIGHT = "/camera/left/image_raw", "/camera/right/image_raw"
 LEFT_INFO, RIGHT_INFO = "/camera/left/camera_info", "/camera/right/camera_info"
 TF, TF_STATIC = "/tf", "/tf_static"
 POSE, GRASP, POINTS, EVENT = "/tool/pose", "/tool/grasp", "/tissue/points", "/event/topology"
+FORCE = "/tool/force"
+"""Topic that is kept for other programs and not read."""
 JSON_TOPICS = (GRASP, EVENT)
 """Topics whose messages are JSON."""
 SCHEMAS: dict[str, tuple[Any, ...]] = {

@@ -15,6 +15,7 @@ from ..camera import StereoCamera
 from ..observation import Declaration, MeasuredPoints, Observation
 from .declaration import METADATA, file_metadata, write_declaration
 from .events import EVENT_SCHEMA, event_json
+from .force import FORCE_SCHEMA, ToolForce, force_json
 from .frames import camera_transforms
 from .mcap_files import McapOutput
 from .schemas import (
@@ -25,7 +26,7 @@ from .schemas import (
     point_cloud,
     pose_message,
 )
-from .topics import EVENT, GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
+from .topics import EVENT, FORCE, GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
 
 
 class RecordingWriter:
@@ -89,6 +90,10 @@ class RecordingWriter:
         if observation.points is not None:
             output.message(POINTS, time, _points_message(time, observation.points))
         output.flush()
+
+    def write_force(self, force: ToolForce) -> None:
+        """Write a measured force at its own time."""
+        self._output.json(FORCE, force.time, force_json(force), schema=FORCE_SCHEMA)
 
     def close(self) -> None:
         """Write the index and close the file."""

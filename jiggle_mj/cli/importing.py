@@ -1,0 +1,152 @@
+"""The verbs `import` and `inspect`: a robot's bag or a folder of measured points becomes a recording."""
+
+import json
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from rich.table import Table
+
+from ..errors import OptionError
+from .options import AsJson, Out, PathArgument, Repeated
+from .terminal import console
+
+if TYPE_CHECKING:
+    from ..importing.bags.settings import BagSettings
+
+
+def import_(
+    path: PathArgument,
+    /,
+    *,
+    out: Out,
+    recording: Path | None = None,
+    topics: Path | None = None,
+    topic: Repeated = (),
+    closed: str | None = None,
+    camera_info: Repeated = (),
+    pairing_tolerance: float | None = None,
+    grasp_radius: float | None = None,
+    world: str | None = None,
+    clock: Literal["header", "receive"] | None = None,
+    overwrite: bool = False,
+    allow_outside: bool = False,
+    as_json: AsJson = False,
+) -> None:
+    """Convert a robot's bag, or a folder of measured points, to a recording.
+
+    A ROS 1 or ROS 2 bag has its topics guessed and printed: docs/BAGS.md. A folder of points is described by its
+    recording.toml: docs/RECORDINGS.md.
+
+    Args:
+        path: a bag (.bag, .mcap, .db3, or the folder of a ROS 2 bag), or a folder of data files.
+        out: the recording to write; attachments that a recording.toml knows go to a separate truth file beside it.
+        recording: the recording.toml; that of the folder if left out.
+        topics: of a bag: a map.toml that says what its topics are for.
+        topic: of a bag: the topic of one role, such as left=/psm/left/image_raw; may be repeated. Roles: left, right,
+            left_info, right_info, tool, gripper, points, depth, depth_info, force.
+        closed: of a bag: when the jaws are closed, such as 'jaw<0.1', 'data==false', or always.
+        camera_info: of a bag: a camera's calibration file, such as left=left.yaml; may be repeated.
+        pairing_tolerance: of a bag: largest difference between the stamps of a left and a right image [ms]; 5 if left
+            out.
+        grasp_radius: of a bag: radius of the grip [m]; 0.002 if left out.
+        world: of a bag: coordinate frame that counts as the world, z up; the root of /tf if left out.
+        clock: of a bag: whose time a message has, its header's or the recorder's that received it; header if left out.
+        overwrite: replace existing files.
+        allow_outside: of a folder: read data files outside it where the TOML names them.
+        as_json: print a summary to stdout as JSON.
+    """
+    from ..importing.bags.bag_file import is_bag
+
+    options = {
+        "topic": topic,
+        "closed": closed,
+        "camera_info": camera_info,
+        "pairing_tolerance": pairing_tolerance,
+        "grasp_radius": grasp_radius,
+        "world": world,
+        "clock": clock,
+    }
+    if is_bag(path):
+        if recording is not None:
+            raise OptionError(f"--recording describes a folder of points, and {path} is a bag; use --topics.")
+        _import_bag(path, out, _settings(topics, options), overwrite=overwrite, as_json=as_json)
+        return
+    given = [name for name, value in {"topics": topics, **options}.items() if value not in (None, ())]
+    if given:
+        raise OptionError(f"--{given[0].replace('_', '-')} is for a bag, and {path} is none.")
+    _import_folder(path, recording, out, overwrite=overwrite, allow_outside=allow_outside, as_json=as_json)
+
+
+def inspect(
+    path: PathArgument, /, *, topics: Path | None = None, topic: Repeated = (), as_json: AsJson = False
+) -> None:
+    """Print what is in a bag or a recording: topics, types, rates, frames, spans, and what an estimate lacks.
+
+    Args:
+        path: a bag (.bag, .mcap, .db3, or the folder of a ROS 2 bag), or a recording.
+        topics: a map.toml that says what the topics of a bag are for.
+        topic: the topic of one role, such as left=/psm/left/image_raw; may be repeated.
+        as_json: print it to stdout as JSON.
+    """
+    from ..importing.bags.inspection import inspect_bag
+
+    report = inspect_bag(path, _settings(topics, {"topic": topic}))
+    table = Table("topic", "type", "messages", "Hz", "from [s]", "to [s]", "frames", "role", box=None)
+    for each in report.topics:
+        begin, end = ("-", "-") if each.span is None else (f"{time:.3f}" for time in each.span)
+        rate = "-" if each.rate is None else f"{each.rate:.4g}"
+        shown = each.type.replace("/msg/", "/") + ("" if each.stamped is not False else " (no stamp)")
+        table.add_row(
+            each.name, shown, str(each.count), rate, begin, end, ", ".join(each.frames) or "-", each.role or "-"
+        )
+    console.print(f"{path}: a {report.kind}")
+    console.print(table)
+    for lack in report.missing:
+        console.print(f"missing: {lack}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"next: {report.next_command}", markup=False, highlight=False, soft_wrap=True)
+    if as_json:
+        print(json.dumps(asdict(report), default=str))
+
+
+def _settings(topics: Path | None, options: dict) -> "BagSettings":
+    from ..importing.bags.settings import BagSettings, read_map, with_options
+
+    return with_options(BagSettings() if topics is None else read_map(topics), **options)
+
+
+def _import_bag(path: Path, out: Path, settings: "BagSettings", *, overwrite: bool, as_json: bool) -> None:
+    from ..importing.bags.importer import import_bag
+
+    summary = import_bag(path, out, settings, overwrite=overwrite)
+    table = Table("role", "topic", "", box=None)
+    for role, name in summary.topics.items():
+        table.add_row(role, name, "guessed" if role in summary.guessed else "given")
+    console.print(table)
+    for note in summary.notes:
+        console.print(note, markup=False, highlight=False, soft_wrap=True)
+    for why, count in summary.skipped.items():
+        console.print(f"left out {count} frames: {why}", markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"wrote {summary.recording}: {summary.n_frames} frames over {summary.duration:.3g} s, {summary.n_grasps} grasps"
+    )
+    if as_json:
+        print(json.dumps({f.name: getattr(summary, f.name) for f in fields(summary)}, default=str))
+
+
+def _import_folder(
+    folder: Path, recording: Path | None, out: Path, *, overwrite: bool, allow_outside: bool, as_json: bool
+) -> None:
+    from ..importing.folder import import_folder
+
+    summary = import_folder(folder, recording, out, overwrite=overwrite, allow_outside=allow_outside)
+    for note in summary.notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    for name, why in summary.skipped:
+        console.print(f"left out {name}: {why}")
+    console.print(
+        f"wrote {summary.recording}: {summary.n_frames} frames of {summary.n_points} points, {summary.n_unseen} "
+        f"missing points over all frames, {summary.n_held} held; truth: {summary.truth or 'none'}"
+    )
+    if as_json:
+        print(json.dumps(asdict(summary), default=str))

@@ -1,0 +1,309 @@
+"""Opening ROS bags: which topics a bag has, and its messages, decoded.
+
+Reads ROS 1 `.bag` files, ROS 2 folders, and single `.mcap` and `.db3` files, through the library rosbags. An MCAP file
+is read here front to back, because rosbags reads no ROS 1 messages in MCAP. A message type is parsed only when a topic
+of it is read, so a definition that nobody needs cannot stop an import.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from mcap.records import Channel, Message, Schema
+
+from ...errors import RecordingError
+from ...recording.mcap_files import iterate_records
+
+STORAGE_SUFFIXES = (".mcap", ".db3")
+"""Suffixes of the files that a ROS 2 bag consists of."""
+ROS_ENCODINGS = ("cdr", "ros1")
+"""Encodings of the messages of ROS 2 and ROS 1."""
+SHOWN_REASON = 200
+"""Characters of a library's own reason that a message shows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagTopic:
+    """One topic of a bag."""
+
+    name: str
+    """Name of the topic."""
+    type: str
+    """Type of its messages in ROS 2's form, such as sensor_msgs/msg/Image."""
+    count: int
+    """Number of its messages."""
+    encoding: str
+    """Encoding of its messages: one of `ROS_ENCODINGS`, or a foreign one, which is not decoded."""
+    definition: str = ""
+    """Definition of the type as the bag holds it; empty where it holds none."""
+    definition_format: str = "msg"
+    """Language of the definition: `msg` or `idl`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagMessage:
+    """One decoded message of a bag."""
+
+    topic: str
+    """Name of its topic."""
+    number: int
+    """Number of the message within its topic, from 0, in the order of the bag."""
+    received: int
+    """Time at which the recorder received it [ns]."""
+    content: Any
+    """The message, with the fields of its definition."""
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path looks like a ROS bag: one of its files, or a folder of them without a recording.toml."""
+    if path.is_dir():
+        return not (path / "recording.toml").exists() and (
+            (path / "metadata.yaml").exists() or bool(_storage_files(path)) or any(path.glob("*.bag"))
+        )
+    return path.suffix in (*STORAGE_SUFFIXES, ".bag", ".active", ".zstd")
+
+
+class Bag:
+    """A ROS bag that is open for reading.
+
+    Args:
+        path: a `.bag`, `.mcap` or `.db3` file, or the folder of a ROS 2 bag.
+
+    Raises:
+        RecordingError: the library rosbags is missing, or the bag is missing, damaged or of an unknown kind.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._stack = ExitStack()
+        with _refusing(path):
+            self._sources = [self._open(file) for file in _bag_files(path)]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._stack.close()
+
+    @cached_property
+    def topics(self) -> dict[str, BagTopic]:
+        """Return the topics by name; one with messages of several types is refused where it is read."""
+        merged: dict[str, BagTopic] = {}
+        with _refusing(self.path):
+            for source in self._sources:
+                for topic in source.topics():
+                    known = merged.get(topic.name)
+                    merged[topic.name] = topic if known is None else replace(known, count=known.count + topic.count)
+        return dict(sorted(merged.items()))
+
+    def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
+        """Yield the decoded messages of some topics in the order of the bag.
+
+        Raises:
+            RecordingError: the bag is damaged, or a message cannot be decoded by its definition.
+        """
+        decoders = {name: _Decoder(self.path, self.topics[name]) for name in names}
+        numbers: Counter[str] = Counter()
+        for source in self._sources:
+            raw = source.messages(set(names))
+            while True:
+                with _refusing(self.path):
+                    item = next(raw, None)
+                if item is None:
+                    break
+                name, received, data = item
+                content = decoders[name].decode(data)
+                yield BagMessage(topic=name, number=numbers[name], received=received, content=content)
+                numbers[name] += 1
+
+    def receipts(self, names: Collection[str]) -> Iterator[tuple[str, int]]:
+        """Yield topic and time of receipt [ns] of messages that need not be decoded.
+
+        Raises:
+            RecordingError: the bag is damaged.
+        """
+        for source in self._sources if names else []:
+            raw = source.messages(set(names))
+            while True:
+                with _refusing(self.path):
+                    item = next(raw, None)
+                if item is None:
+                    break
+                yield item[0], item[1]
+
+    def _open(self, file: Path) -> "_McapFile | _RosbagsFile":
+        if file.suffix == ".mcap":
+            return _McapFile(file)
+        from rosbags import rosbag1, rosbag2
+
+        return _RosbagsFile(
+            self._stack.enter_context((rosbag1 if file.suffix == ".bag" else rosbag2).Reader(file)),
+            "ros1" if file.suffix == ".bag" else "cdr",
+        )
+
+
+class _RosbagsFile:
+    """A bag that rosbags reads: a ROS 1 file, or a ROS 2 folder or sqlite3 file."""
+
+    def __init__(self, reader: Any, encoding: str) -> None:
+        self._reader, self._encoding = reader, encoding
+
+    def topics(self) -> Iterator[BagTopic]:
+        """Yield the topics; one that several publishers share comes once for each."""
+        for connection in self._reader.connections:
+            yield BagTopic(
+                name=connection.topic,
+                type=connection.msgtype,
+                count=connection.msgcount,
+                encoding=self._encoding,
+                definition=connection.msgdef.data,
+                definition_format="idl" if connection.msgdef.format.name == "IDL" else "msg",
+            )
+
+    def messages(self, names: set[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yield topic, time of receipt [ns] and data of each message."""
+        wanted = [connection for connection in self._reader.connections if connection.topic in names]
+        if wanted:
+            for connection, received, data in self._reader.messages(connections=wanted):
+                yield connection.topic, received, data
+
+
+class _McapFile:
+    """A single MCAP file, with messages of ROS 2 or ROS 1."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._topics: dict[str, BagTopic] | None = None
+
+    def topics(self) -> Iterator[BagTopic]:
+        """Yield the topics with their counts, which takes a pass over the file."""
+        if self._topics is None:
+            counts: Counter[str] = Counter()
+            for channel, _ in self._records():
+                counts[channel.topic] += 1
+            self._topics = {name: replace(topic, count=counts[name]) for name, topic in self._seen.items()}
+        yield from self._topics.values()
+
+    def messages(self, names: set[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yield topic, time of receipt [ns] and data of each message."""
+        for channel, message in self._records():
+            if channel.topic in names:
+                yield channel.topic, message.log_time, message.data
+
+    def _records(self) -> Iterator[tuple[Channel, Message]]:
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        self._seen: dict[str, BagTopic] = {}
+        for record in iterate_records(self._path):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+                self._seen.setdefault(record.topic, _mcap_topic(record, schemas.get(record.schema_id)))
+            elif isinstance(record, Message) and record.channel_id in channels:
+                yield channels[record.channel_id], record
+
+
+class _Decoder:
+    """Decoder of the messages of one topic, by the definition in the bag, or else by ROS's own."""
+
+    def __init__(self, path: Path, topic: BagTopic) -> None:
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+        self._path, self._topic = path, topic
+        if topic.encoding not in ROS_ENCODINGS:
+            raise RecordingError(
+                f"{path}: {topic.name} is {topic.type} encoded as '{topic.encoding}'; messages of ROS 1 and ROS 2 are "
+                "read."
+            )
+        if not topic.definition.strip():
+            self._store = get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
+            if topic.type not in self._store.fielddefs:
+                raise RecordingError(
+                    f"{path}: {topic.name} has the type {topic.type}, which the bag does not define; leave the topic "
+                    "out, or record it again as MCAP, which keeps definitions."
+                )
+            return
+        with _refusing(path, f"the definition of {topic.type}"):
+            self._store = get_typestore(Stores.EMPTY)
+            if topic.definition_format == "idl":
+                for part in re.split(r"=+\nIDL: .*\n", topic.definition):
+                    if part.strip():
+                        self._store.register(get_types_from_idl(part))
+            else:
+                self._store.register(get_types_from_msg(topic.definition, topic.type))
+
+    def decode(self, data: bytes) -> Any:
+        with _refusing(self._path, f"a message on {self._topic.name} ({self._topic.type})"):
+            if self._topic.encoding == "ros1":
+                return self._store.deserialize_ros1(data, self._topic.type)
+            return self._store.deserialize_cdr(data, self._topic.type)
+
+
+def _mcap_topic(channel: Channel, schema: Schema | None) -> BagTopic:
+    encoding, name, text = channel.message_encoding, "unknown", ""
+    if schema is not None:
+        name, text = schema.name, schema.data.decode(errors="replace")
+    if encoding in ROS_ENCODINGS and name.count("/") == 1:
+        name = name.replace("/", "/msg/")
+    return BagTopic(
+        name=channel.topic,
+        type=name,
+        count=0,
+        encoding=encoding,
+        definition=text if encoding in ROS_ENCODINGS else "",
+        definition_format="idl" if schema is not None and schema.encoding in ("ros2idl", "omgidl") else "msg",
+    )
+
+
+def _storage_files(folder: Path) -> list[Path]:
+    """Return the storage files of a folder, numbers in their names in the order of counting."""
+    files = [file for suffix in STORAGE_SUFFIXES for file in folder.glob(f"*{suffix}")]
+    return sorted(files, key=lambda file: [(part.isdigit(), part.zfill(20)) for part in re.split(r"(\d+)", file.name)])
+
+
+def _bag_files(path: Path) -> list[Path]:
+    """Return what to open for a bag: the path itself, or the files of a folder that lost its metadata.yaml."""
+    try:
+        import rosbags.typesys  # noqa: F401
+    except ImportError as failure:
+        raise RecordingError(
+            f"{path}: reading ROS bags needs the library rosbags; install it: pip install 'jiggle-mj[ros]'."
+        ) from failure
+    if not path.exists():
+        raise RecordingError(f"{path} cannot be read: there is no such file or folder.")
+    if path.is_dir():
+        if (path / "metadata.yaml").exists():
+            return [path]
+        files = _storage_files(path) or sorted(path.glob("*.bag"))
+        if not files:
+            raise RecordingError(f"{path} holds no bag: no metadata.yaml, and no .mcap, .db3 or .bag file.")
+        return files
+    if path.suffix not in (*STORAGE_SUFFIXES, ".bag"):
+        raise RecordingError(
+            f"{path} is not read as a bag: give a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag "
+            "(a .bag.active file was not closed: 'rosbag reindex' mends it)."
+        )
+    return [path]
+
+
+@contextmanager
+def _refusing(path: Path, part: str = "the bag") -> Iterator[None]:
+    """Turn what the libraries raise for damaged data into one line.
+
+    Catches every Exception on purpose: a damaged bag surfaces as errors of rosbags, apsw, zstandard, lz4, struct, yaml
+    and as bare KeyErrors and assertions, and no list of them is complete.
+    """
+    try:
+        yield
+    except RecordingError:
+        raise
+    except Exception as failure:
+        reason = " ".join((str(failure) or type(failure).__name__).split())[:SHOWN_REASON]
+        raise RecordingError(f"{path}: {part} cannot be read ({reason}); is it damaged or cut off?") from failure

@@ -1,0 +1,71 @@
+"""What a bag lacks for an estimate, in words, with the cure: for an import that must stop, and for `inspect`."""
+
+from collections.abc import Mapping
+
+from .gripper import ALWAYS
+from .roles import TYPES, RoleChoice
+from .settings import BagSettings, Role
+
+NEEDS = {
+    "left": "a left image",
+    "right": "a right image",
+    "left_info": "the left camera's CameraInfo",
+    "right_info": "the right camera's CameraInfo",
+    "tool": "the pose of the tool",
+    "gripper": "the state of the gripper",
+    "depth_info": "the depth camera's CameraInfo",
+}
+"""What each role that can be missing stands for."""
+
+
+def missing_roles(
+    roles: Mapping[Role, RoleChoice], unsure: Mapping[Role, list[str]], settings: BagSettings
+) -> list[str]:
+    """Return what is missing, one sentence each; empty where an import can begin.
+
+    Args:
+        roles: the topics that were chosen.
+        unsure: candidates of roles that need the user's word.
+        settings: what the user says.
+    """
+    needed: list[Role] = ["tool"]
+    if settings.closed is None or settings.closed.comparison != ALWAYS:
+        needed.append("gripper")
+    by_camera = "left" in roles or "right" in roles or "left" in unsure or "right" in unsure
+    found: list[str] = []
+    if "points" in roles and not {"left", "right"} <= set(roles):
+        by_camera = False
+    elif "depth" in roles and not {"left", "right"} <= set(roles):
+        by_camera = False
+        needed.append("depth_info")
+    elif by_camera:
+        needed += ["left", "right"]
+        needed += [
+            role
+            for role, side in (("left_info", "left"), ("right_info", "right"))
+            if side not in settings.camera_info and side in roles
+        ]
+    else:
+        found.append(
+            "images of both cameras (name them: --topic left=... --topic right=...), tracked points (--topic "
+            "points=...) or depth (--topic depth=...)"
+        )
+    for role in needed:
+        if role in roles:
+            continue
+        if role in unsure:
+            found.append(f"{NEEDS[role]}: one of {', '.join(unsure[role][:8])} (--topic {role}=TOPIC)")
+        else:
+            found.append(f"{NEEDS[role]} ({_cure(role)})")
+    return found
+
+
+def _cure(role: Role) -> str:
+    types = " or ".join(name.rpartition("/")[2] for name in TYPES[role])
+    extra = {
+        "gripper": "; a bag of one grasp: --closed always",
+        "tool": "; a frame of /tf: --topic tool=tf:FRAME",
+        "left_info": "; a file: --camera-info left=FILE",
+        "right_info": "; a file: --camera-info right=FILE",
+    }.get(role, "")
+    return f"--topic {role}=TOPIC of type {types}{extra}"

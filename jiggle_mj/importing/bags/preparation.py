@@ -1,0 +1,268 @@
+"""All that an import knows before it reads the first image: camera, tool, jaws, frames and what to say about them."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ...camera import CameraCalibration, StereoCamera
+from ...errors import RecordingError
+from ...observation import Declaration
+from ...recording.force import ToolForce
+from .bag_file import Bag
+from .calibration import CameraSource, parse_camera_info, read_camera_file, stereo_camera
+from .gripper import ALWAYS, JawState, jaw_states, jaw_value
+from .missing import missing_roles
+from .roles import RoleChoice, is_rectified
+from .settings import MS, BagSettings, Role
+from .stamps import refuse_apart
+from .stereo_pairs import pair_images
+from .survey import BagSurvey, survey_bag
+from .tool_track import ToolTrack
+from .transforms import TransformTree
+
+CLOUD_TOLERANCE = 5 * MS
+"""Largest difference of the stamps of a cloud and a left image of one frame [ns]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameParts:
+    """The messages that make one frame."""
+
+    stamp: int
+    """Time of the frame: that of its left image, cloud or depth image [ns]."""
+    parts: dict[Role, int]
+    """Number of the message of each role within its topic."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preparation:
+    """What an import knows before the images."""
+
+    settings: BagSettings
+    """What the user says."""
+    roles: dict[Role, RoleChoice]
+    """Topic of each role."""
+    tree: TransformTree
+    """All coordinate frames."""
+    world: str
+    """Frame that counts as the world."""
+    camera: StereoCamera | None
+    """The stereo camera; None without a pair."""
+    order_unsure: bool
+    """Whether only the images can tell the left camera from the right one."""
+    depth_calibration: CameraCalibration | None
+    """Calibration of the depth camera; None without depth."""
+    declaration: Declaration
+    """The user's prior knowledge of the tissue."""
+    tool: ToolTrack
+    """Where the tip is."""
+    jaws: list[JawState]
+    """The jaws, by time."""
+    forces: list[ToolForce]
+    """Forces on the tool, by time on the bag's clock."""
+    frames: list[FrameParts]
+    """The frames to come, by time."""
+    notes: tuple[str, ...]
+    """What was measured, assumed or left out."""
+
+    def topic(self, role: Role) -> str:
+        """Return the topic of a role."""
+        return self.roles[role].topic
+
+
+def prepare(
+    bag: Bag, roles: dict[Role, RoleChoice], unsure: dict[Role, list[str]], settings: BagSettings
+) -> Preparation:
+    """Read all of a bag but its images and clouds.
+
+    Args:
+        bag: the open bag.
+        roles: topic of each role.
+        unsure: candidates of roles that need the user's word.
+        settings: what the user says.
+
+    Raises:
+        RecordingError: something that an estimate needs is missing or contradicts itself.
+    """
+    missing = missing_roles(roles, unsure, settings)
+    if missing:
+        raise RecordingError(f"{bag.path} lacks {'; '.join(missing)}. 'jiggle-mj inspect {bag.path}' lists its topics.")
+    stereo = {"left", "right"} <= set(roles)
+    if stereo and not any(roles[role].by_user for role in ("points", "depth") if role in roles):
+        roles = {role: choice for role, choice in roles.items() if role not in ("points", "depth", "depth_info")}
+    survey = survey_bag(bag, roles, settings)
+    notes = list(survey.notes)
+    main: Role = "left" if stereo else "points" if "points" in roles else "depth"
+    world, declaration = _world(survey, main, settings, notes)
+    camera, order_unsure = None, False
+    if stereo:
+        camera, order_unsure = _camera(bag, survey, roles, settings, world, notes)
+    depth = None
+    if main == "depth":
+        info = survey.messages["depth_info"][0]
+        depth = parse_camera_info(info, roles["depth_info"].topic, survey.frame["depth_info"]).calibration
+    frames = _frames(survey, main, settings, notes)
+    stamps = [frame.stamp for frame in frames]
+    tool = _tool(survey, roles, world, notes)
+    refuse_apart(stamps, roles[main].topic, tool.times.tolist(), roles["tool"].topic)
+    return Preparation(
+        settings=settings,
+        roles=roles,
+        tree=survey.tree,
+        world=world,
+        camera=camera,
+        order_unsure=order_unsure,
+        depth_calibration=depth,
+        declaration=declaration,
+        tool=tool,
+        jaws=_jaws(survey, roles, settings, stamps, notes),
+        forces=_forces(survey),
+        frames=frames,
+        notes=tuple(notes),
+    )
+
+
+def _world(survey: BagSurvey, main: Role, settings: BagSettings, notes: list[str]) -> tuple[str, Declaration]:
+    """Return the frame that counts as the world, and the declaration, without gravity where up is unknown."""
+    sensor, tree = survey.frame[main], survey.tree
+    world = settings.world or (tree.root(sensor) if sensor else "world")
+    if settings.world is not None and settings.world not in tree.names and settings.world != sensor:
+        raise RecordingError(
+            f"/tf has no frame '{settings.world[:200]}'; it has: {', '.join(sorted(tree.names)[:20]) or 'none'}."
+        )
+    if world == sensor and settings.declaration is None and "optical" in world:
+        notes.append(f"the world is the camera's frame '{world}', whose vertical is unknown: gravity is left out")
+        return world, replace(Declaration(), gravity=(0.0, 0.0, 0.0), bed=False)
+    notes.append(f"the world is the frame '{world}', z up")
+    return world, settings.declaration or Declaration()
+
+
+def _camera(
+    bag: Bag,
+    survey: BagSurvey,
+    roles: dict[Role, RoleChoice],
+    settings: BagSettings,
+    world: str,
+    notes: list[str],
+) -> tuple[StereoCamera, bool]:
+    sources: dict[Role, CameraSource] = {}
+    for role, info, side in (("left", "left_info", "left"), ("right", "right_info", "right")):
+        frame = survey.frame[role]
+        if side in settings.camera_info:
+            sources[role] = read_camera_file(settings.camera_info[side], frame)
+            continue
+        messages, where = survey.messages[info], roles[info].topic
+        sources[role] = parse_camera_info(messages[0], where, frame or survey.frame[info])
+        if any(not _same_info(messages[0], other) for other in messages[1:]):
+            notes.append(f"{where} changes during the bag (zoom or focus?); its first message is used")
+    left, right, tree = sources["left"].frame, sources["right"].frame, survey.tree
+    stamp = min(survey.times["left"].stamps)
+    where = roles["left"].topic
+    if left and left != world:
+        for name, motion in tree.moving(left, world):
+            raise RecordingError(
+                f"{bag.path}: the camera moves: '{name}' strays by {1e3 * motion.distance:.3g} mm and "
+                f"{np.degrees(motion.angle):.3g} degrees from its mean on /tf; a camera that stands still is read. "
+                "Import a part of the bag in which it stands still, or name a frame that moves with the tissue with "
+                "--world."
+            )
+    T_world_left = tree.T_world(left or world, world, stamp, where)
+    T_left_right = None
+    if left and right and left != right and left in tree.names and right in tree.names:
+        if tree.root(left) == tree.root(right):
+            root = tree.root(left)
+            T_left_right = np.linalg.inv(tree.T_world(left, root, stamp, where)) @ tree.T_world(
+                right, root, stamp, where
+            )
+    rectified = is_rectified(where) if settings.rectified is None else settings.rectified
+    camera, unsure, said = stereo_camera(
+        sources["left"],
+        sources["right"],
+        T_world_left=T_world_left,
+        T_left_right=T_left_right,
+        rectified=rectified,
+    )
+    raw = "rectified" if rectified else "raw"
+    notes += [*said, f"{camera.left.width}x{camera.left.height} {raw} images, baseline {1e3 * camera.baseline:.4g} mm"]
+    return camera, unsure
+
+
+def _same_info(first: Any, other: Any) -> bool:
+    """Return whether two CameraInfo messages have the same matrices."""
+    names = ("k", "d", "r", "p") if hasattr(first, "k") else ("K", "D", "R", "P")
+    return all(np.array_equal(getattr(first, name), getattr(other, name)) for name in names)
+
+
+def _frames(survey: BagSurvey, main: Role, settings: BagSettings, notes: list[str]) -> list[FrameParts]:
+    times = survey.times[main]
+    if main != "left":
+        return [FrameParts(stamp=times.stamps[number], parts={main: number}) for number in times.order]
+    rights = survey.times["right"]
+    pairs = pair_images(times.stamps, rights.stamps, settings.pairing_tolerance_ms)
+    notes.append(pairs.summary())
+    clouds = survey.times.get("points")
+    order = [] if clouds is None else clouds.order
+    known = np.array([] if clouds is None else [clouds.stamps[number] for number in order], np.int64)
+    frames: list[FrameParts] = []
+    for left, right in zip(pairs.left.tolist(), pairs.right.tolist(), strict=True):
+        parts: dict[Role, int] = {"left": left, "right": right}
+        stamp = times.stamps[left]
+        if len(known):
+            nearest = int(np.abs(known - stamp).argmin())
+            if abs(int(known[nearest]) - stamp) <= CLOUD_TOLERANCE:
+                parts["points"] = order[nearest]
+        frames.append(FrameParts(stamp=stamp, parts=parts))
+    return frames
+
+
+def _tool(survey: BagSurvey, roles: dict[Role, RoleChoice], world: str, notes: list[str]) -> ToolTrack:
+    frame = roles["tool"].frame
+    if frame is not None:
+        tool = ToolTrack.from_frame(frame, survey.tree, world)
+    else:
+        tool = ToolTrack.from_messages(survey.messages["tool"], survey.times["tool"], survey.tree, world)
+    if tool.n_dropped:
+        notes.append(f"{roles['tool'].topic}: {tool.n_dropped} poses are left out: NaN, or not joined to '{world}'")
+    return tool
+
+
+def _jaws(
+    survey: BagSurvey,
+    roles: dict[Role, RoleChoice],
+    settings: BagSettings,
+    stamps: list[int],
+    notes: list[str],
+) -> list[JawState]:
+    rule = settings.closed
+    if "gripper" not in roles or (rule is not None and rule.comparison == ALWAYS):
+        notes.append("the jaws are taken as closed in all frames (--closed always)")
+        return [JawState(time=stamps[0], closed=True, grasp=1)]
+    times, messages = survey.times["gripper"], survey.messages["gripper"]
+    values = [jaw_value(messages[number], rule, times.topic) for number in times.order]
+    ordered = [times.stamps[number] for number in times.order]
+    refuse_apart(stamps, "the frames", ordered, times.topic)
+    states, n_short = jaw_states(ordered, values, rule, times.topic)
+    if n_short:
+        notes.append(f"{times.topic}: {n_short} changes of less than 0.1 s are ignored")
+    if stamps[0] + CLOUD_TOLERANCE < ordered[0]:
+        early = sum(stamp + CLOUD_TOLERANCE < ordered[0] for stamp in stamps)
+        notes.append(f"{times.topic} begins after {early} frames; the jaws count as open until then")
+    closes = "closed as its messages say" if rule is None else str(rule)
+    notes.append(f"gripper: {closes}")
+    return states
+
+
+def _forces(survey: BagSurvey) -> list[ToolForce]:
+    if "force" not in survey.messages:
+        return []
+    times, found = survey.times["force"], []
+    for number in times.order:
+        message = survey.messages["force"][number]
+        wrench = message.wrench
+        force, torque = (tuple(float(getattr(each, axis)) for axis in "xyz") for each in (wrench.force, wrench.torque))
+        if np.isfinite([*force, *torque]).all():
+            found.append(
+                ToolForce(time=times.stamps[number], force=force, torque=torque, frame_id=message.header.frame_id)
+            )
+    return found

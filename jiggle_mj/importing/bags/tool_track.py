@@ -1,0 +1,135 @@
+"""The tip of the tool in the world over time: from a topic of poses, or from a frame of /tf.
+
+Between two reports the position is interpolated linearly and the orientation along the shortest rotation; all reports
+are kept for the recording.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation, Slerp
+
+from ...camera import matrix_from_quaternion
+from ...errors import RecordingError
+from ...observation import ToolReport
+from .stamps import TopicTimes
+from .transforms import TransformTree, frame_name, parse_ros_pose
+
+MAX_REPORT_AGE = 100_000_000
+"""Longest time from a report to a frame that it speaks for [ns]; twice that between two reports around it."""
+MIN_DISTANCE = 5_000_000
+"""Time after a frame in which a report is dropped [ns]: a reader would take it for the frame's own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToolTrack:
+    """The reports of the tool."""
+
+    times: Int[np.ndarray, " n"]
+    """Times of the reports, increasing [ns]."""
+    positions: Float[np.ndarray, "n 3"]
+    """Positions of the tip in the world [m]."""
+    quats_wxyz: Float[np.ndarray, "n 4"]
+    """Orientations in the world."""
+    n_dropped: int
+    """Number of reports that are no pose, or whose frame /tf does not know at their time."""
+
+    @classmethod
+    def from_messages(cls, messages: list[Any], times: TopicTimes, tree: TransformTree, world: str) -> Self:
+        """Return the track of `PoseStamped` or `TransformStamped` messages.
+
+        Raises:
+            RecordingError: no message is a pose that /tf joins to the world.
+        """
+        found: list[tuple[int, np.ndarray, np.ndarray]] = []
+        failure, dropped = None, 0
+        for number in times.order:
+            message, stamp = messages[number], times.stamps[number]
+            try:
+                if hasattr(message, "pose"):
+                    pose = parse_ros_pose(message.pose.position, message.pose.orientation, times.topic)
+                else:
+                    pose = parse_ros_pose(message.transform.translation, message.transform.rotation, times.topic)
+                T = tree.T_world(frame_name(message.header.frame_id) or world, world, stamp, times.topic)
+            except RecordingError as reason:
+                failure, dropped = reason, dropped + 1
+                continue
+            found.append((stamp, *_in_world(T, *pose)))
+        if not found:
+            raise failure or RecordingError(f"{times.topic} holds no pose.")
+        return cls._of(found, dropped)
+
+    @classmethod
+    def from_frame(cls, name: str, tree: TransformTree, world: str) -> Self:
+        """Return the track of a frame of /tf, with a report at each message of a moving frame between it and the world.
+
+        Raises:
+            RecordingError: /tf does not join the frame to the world, or it does not move.
+        """
+        name = frame_name(name)
+        moving = [each for each, _ in tree.moving(name, world)]
+        if not moving:
+            raise RecordingError(f"the tool's frame '{name}' does not move on /tf; is it the right frame?")
+        found: list[tuple[int, np.ndarray, np.ndarray]] = []
+        dropped = 0
+        for time in np.unique(np.concatenate([tree.track(each).times for each in moving])).tolist():
+            try:
+                T = tree.T_world(name, world, time, f"the tool 'tf:{name}'")
+            except RecordingError:
+                dropped += 1
+                continue
+            quat = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+            found.append((time, T[:3, 3].copy(), quat))
+        if not found:
+            raise RecordingError(f"/tf never joins the tool's frame '{name}' to '{world}' at one time.")
+        return cls._of(found, dropped)
+
+    @classmethod
+    def _of(cls, found: list[tuple[int, np.ndarray, np.ndarray]], dropped: int) -> Self:
+        times, positions, quats = zip(*found, strict=True)
+        return cls(
+            times=np.array(times, np.int64),
+            positions=np.array(positions),
+            quats_wxyz=np.array(quats),
+            n_dropped=dropped,
+        )
+
+    def at(self, time: int) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 4"]]:
+        """Return position [m] and orientation wxyz at a time [ns].
+
+        Raises:
+            RecordingError: no report is near enough.
+        """
+        after = int(np.searchsorted(self.times, time))
+        if after < len(self.times) and self.times[after] == time:
+            return self.positions[after], self.quats_wxyz[after]
+        before = after - 1
+        if before >= 0 and after < len(self.times) and self.times[after] - self.times[before] <= 2 * MAX_REPORT_AGE:
+            span = int(self.times[after] - self.times[before])
+            share = (time - int(self.times[before])) / span
+            position = (1 - share) * self.positions[before] + share * self.positions[after]
+            ends = Rotation.from_quat(self.quats_wxyz[before : after + 1], scalar_first=True)
+            return position, Slerp([0.0, 1.0], ends)(share).as_quat(scalar_first=True)
+        if before >= 0 and time - self.times[before] <= MAX_REPORT_AGE:
+            return self.positions[before], self.quats_wxyz[before]
+        raise RecordingError(f"no tool pose within {MAX_REPORT_AGE // 1_000_000} ms")
+
+    def between(self, begin: int, end: int, origin: int) -> tuple[ToolReport, ...]:
+        """Return the reports between two frames [ns], with times from an origin [ns]."""
+        inside = (self.times > begin + MIN_DISTANCE) & (self.times < end)
+        return tuple(
+            ToolReport(time=int(time) - origin, position=position)
+            for time, position in zip(self.times[inside], self.positions[inside], strict=True)
+        )
+
+
+def _in_world(
+    T: Float[np.ndarray, "4 4"], position: Float[np.ndarray, " 3"], quat_wxyz: Float[np.ndarray, " 4"]
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 4"]]:
+    """Return a pose in the world, bit by bit the given one where its frame is the world."""
+    if np.array_equal(T, np.eye(4)):
+        return position, quat_wxyz
+    R = T[:3, :3] @ matrix_from_quaternion(quat_wxyz)
+    return T[:3, :3] @ position + T[:3, 3], Rotation.from_matrix(R).as_quat(scalar_first=True)
