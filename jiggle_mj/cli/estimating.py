@@ -50,6 +50,9 @@ def run(
     from jiggle_mj.eval.runs.experiment import run_scene
     from jiggle_mj.scenes import disturbed, load_scene
 
+    from ..recording.refusals import refuse_bag
+
+    refuse_bag(Path(scene))
     scene_to_run, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)
     n_actions = most_actions(scene_to_run, policy, steps)
     with deferred_interrupt() as stopped, progress(n_actions, f"run {scene_to_run.name}") as on_frame:

@@ -5,7 +5,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from ..errors import OptionError
 from .options import AsJson, Out, PathArgument, Repeated
@@ -92,7 +92,8 @@ def inspect(
     from ..importing.bags.inspection import inspect_bag
 
     report = inspect_bag(path, _settings(topics, {"topic": topic}))
-    table = Table("topic", "type", "messages", "Hz", "from [s]", "to [s]", "frames", "role", box=None)
+    heads = ("topic", "type", "messages", "Hz", "from [s]", "to [s]", "frames", "role")
+    table = Table(*(Column(head, overflow="fold") for head in heads), box=None)
     for each in report.topics:
         begin, end = ("-", "-") if each.span is None else (f"{time:.3f}" for time in each.span)
         rate = "-" if each.rate is None else f"{each.rate:.4g}"

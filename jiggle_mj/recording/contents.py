@@ -26,7 +26,7 @@ from .frames import FrameTree
 from .mcap_files import iterate_records
 from .messages import checked_stamp, parse_message
 from .pairing import Stamped
-from .refusals import refuse_incomplete, refuse_truth
+from .refusals import refuse_bag, refuse_incomplete, refuse_truth
 from .schemas import parse_grasp, stamp_of
 from .topics import EVENT, GRASP, JSON_TOPICS, LEFT, POINTS, POSE, RIGHT, SCHEMAS
 
@@ -42,6 +42,7 @@ class RecordingContents:
     """
 
     def __init__(self, path: Path, *, allow_truncated: bool) -> None:
+        refuse_bag(path)
         self.path, self._allow_truncated = path, allow_truncated
         self.metadata: dict[str, str] = {}
         self.declaration = Declaration()
@@ -126,6 +127,7 @@ class RecordingContents:
                 schemas[record.id] = record
             elif isinstance(record, Channel):
                 refuse_truth(self.path, record.topic)
+                refuse_bag(self.path, record.message_encoding)
                 topics[record.id] = record.topic
                 self._choose_class(record, schemas.get(record.schema_id))
             elif isinstance(record, Metadata):

@@ -125,14 +125,14 @@ def stereo_camera(
         notes.append(f"baseline {1e3 * (baseline or 0):.4g} mm from /tf, as the calibration has none")
     elif T_left_right is not None:
         along = float((pair[0].R @ T_left_right[:3, 3])[0])
-        if baseline < 0 < along:
+        if along < 0:
+            raise RecordingError(
+                f"by /tf the camera of {right.where} is on the left of that of {left.where}; are the topics swapped? "
+                "Give --topic left=... --topic right=... --topic left_info=... --topic right_info=..."
+            )
+        if baseline < 0:
             baseline = -baseline
             notes.append("P[0,3] of camera_info has the other sign; by /tf the right camera is on the right")
-        elif baseline > 0 > along:
-            raise RecordingError(
-                "by /tf the right camera is on the left of the left one; are the topics swapped? Give --topic left=... "
-                "--topic right=..."
-            )
         if abs(along - baseline) > BASELINE_AGREEMENT * abs(baseline):
             notes.append(
                 f"baseline {1e3 * baseline:.4g} mm by camera_info, {1e3 * along:.4g} mm by /tf; the first is used"

@@ -9,6 +9,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -26,8 +27,8 @@ COMPARISONS = {
 """What a rule may compare by."""
 JOINT_FIELDS = ("position", "velocity", "effort")
 """Fields of a JointState that a rule may use."""
-SHORTEST_HOLD = 100_000_000
-"""Shortest time for which jaws stay closed or open [ns]: quicker changes are noise around the rule's limit."""
+SHORT_HOLD = 100_000_000
+"""Time below which a grasp is likely noise around the rule's limit [ns]: nobody pulls tissue that quickly."""
 ALWAYS = "always"
 """Rule of a bag that shows nothing but one grasp."""
 
@@ -132,7 +133,7 @@ def jaw_value(message: Any, rule: ClosedRule | None, topic: str) -> float | bool
 def jaw_states(
     stamps: Sequence[int], values: Sequence[Any], rule: ClosedRule | None, topic: str
 ) -> tuple[list[JawState], int]:
-    """Return the states of the jaws, one for each change, and how many changes were too short to be meant.
+    """Return the states of the jaws, one for each change, and how many grasps are shorter than `SHORT_HOLD`.
 
     Args:
         stamps: times of the messages, increasing [ns].
@@ -154,20 +155,11 @@ def jaw_states(
         )
     closed = [bool(value) if rule is None else rule.holds(value) for value in numbers]
     changes = [k for k in range(len(closed)) if k == 0 or closed[k] != closed[k - 1]]
-    kept: list[int] = []
-    n_short = 0
-    for place, k in enumerate(changes):
-        end = stamps[changes[place + 1]] if place + 1 < len(changes) else None
-        if kept and closed[kept[-1]] == closed[k]:
-            continue
-        if kept and end is not None and end - stamps[k] < SHORTEST_HOLD:
-            n_short += 1
-            continue
-        kept.append(k)
     states: list[JawState] = []
-    for k in kept:
+    for k in changes:
         grasp = (states[-1].grasp if states else 0) + closed[k]
         states.append(JawState(time=stamps[k], closed=closed[k], grasp=grasp))
+    n_short = sum(after.time - state.time < SHORT_HOLD for state, after in pairwise(states) if state.closed)
     return states, n_short
 
 

@@ -26,6 +26,7 @@ from .camera_order import left_is_left
 from .clouds import cloud_points, depth_points
 from .gripper import state_at
 from .images import rgb_image
+from .missing import refuse_foreign
 from .preparation import FrameParts, Preparation, prepare
 from .roles import choose_roles
 from .settings import BagSettings, Role
@@ -87,6 +88,7 @@ def import_bag(
 
 
 def _import(bag: Bag, out: Path, settings: BagSettings) -> BagSummary:
+    refuse_foreign(bag)
     roles, unsure = choose_roles(bag.topics, settings.topics)
     prepared = prepare(bag, roles, unsure, settings)
     notes = list(prepared.notes)

@@ -3,7 +3,7 @@
 Reads a bag from end to end, as counts and spans need; decodes only the messages of types that an import reads.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -156,7 +156,11 @@ def _report(name: str, kind: str, found: _Found, start: int, role: str | None) -
 def _recording_lacks(path: Path) -> tuple[str, ...]:
     """Return why a recording cannot be estimated; empty where it can."""
     try:
-        Recording.open(path)
+        recording = Recording.open(path)
+        usable = sum(1 for _ in recording)
     except RecordingError as failure:
         return (str(failure),)
-    return ()
+    if not recording.skipped:
+        return ()
+    reason, count = Counter(why for _, why in recording.skipped).most_common(1)[0]
+    return (f"{len(recording.skipped)} of {usable + len(recording.skipped)} frames; {count} times: {reason}",)

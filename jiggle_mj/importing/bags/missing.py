@@ -2,6 +2,9 @@
 
 from collections.abc import Mapping
 
+from ...errors import RecordingError
+from ...recording.topics import GRASP, POSE
+from .bag_file import ROS_ENCODINGS, Bag
 from .gripper import ALWAYS
 from .roles import TYPES, RoleChoice
 from .settings import BagSettings, Role
@@ -16,6 +19,24 @@ NEEDS = {
     "depth_info": "the depth camera's CameraInfo",
 }
 """What each role that can be missing stands for."""
+
+
+def refuse_foreign(bag: Bag) -> None:
+    """Refuse a bag without a message of ROS.
+
+    Raises:
+        RecordingError: it is a recording already, or a file of other messages, or empty.
+    """
+    topics = bag.topics.values()
+    if any(topic.encoding in ROS_ENCODINGS for topic in topics):
+        return
+    if POSE in bag.topics and GRASP in bag.topics:
+        raise RecordingError(f"{bag.path} is a recording already; use it: jiggle-mj estimate {bag.path} --out DIR.")
+    encodings = sorted({f"{topic.type} ({topic.encoding})" for topic in topics})
+    raise RecordingError(
+        f"{bag.path} holds no message of ROS 1 or ROS 2, but {', '.join(encodings[:8]) or 'nothing'}; a file of "
+        "Foxglove's messages is a recording if its topics have the names in docs/RECORDINGS.md."
+    )
 
 
 def missing_roles(

@@ -244,7 +244,9 @@ def _jaws(
     refuse_apart(stamps, "the frames", ordered, times.topic)
     states, n_short = jaw_states(ordered, values, rule, times.topic)
     if n_short:
-        notes.append(f"{times.topic}: {n_short} changes of less than 0.1 s are ignored")
+        notes.append(
+            f"{times.topic}: {n_short} grasps are shorter than 0.1 s; is that noise around the limit of --closed?"
+        )
     if stamps[0] + CLOUD_TOLERANCE < ordered[0]:
         early = sum(stamp + CLOUD_TOLERANCE < ordered[0] for stamp in stamps)
         notes.append(f"{times.topic} begins after {early} frames; the jaws count as open until then")
