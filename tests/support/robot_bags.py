@@ -217,3 +217,59 @@ def rotated(degrees: float) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     return T
+
+
+STEP = 100_000_000
+"""Time from frame to frame of `small_bag` [ns]."""
+
+
+def small_camera() -> StereoCamera:
+    """Return a camera of 32x24 pixels that looks down from 0.1 m."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[2, 3] = 0.1
+    return StereoCamera.rectified(width=32, height=24, focal=40.0, baseline=0.005, T_world_camera=T)
+
+
+def small_image(seed: int) -> np.ndarray:
+    """Return an RGB image of noise."""
+    return np.random.default_rng(seed).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+
+
+def write_tool(bag: RobotBag, n: int = 4, *, every: int = STEP, frame: str = "world") -> None:
+    """Write poses along x, 1 mm per `STEP`, and a Bool that closes at the second frame."""
+    for time in range(0, n * STEP, every):
+        bag.pose("/tool/pose", time, [1e-3 * time / STEP, 0.02, 0.0], header=bag.header(time, frame))
+    for index in range(n):
+        bag.write("/gripper/closed", index * STEP, "std_msgs/Bool", data=index > 0)
+
+
+def write_images(bag: RobotBag, n: int = 4, *, late: int = 0) -> None:
+    """Write stereo pairs, the right images later by a time [ns]."""
+    for index in range(n):
+        bag.image("/left/image_raw", index * STEP, "rgb8", small_image(2 * index))
+        bag.image("/right/image_raw", index * STEP + late, "rgb8", small_image(2 * index + 1))
+
+
+def small_bag(path: Path, kind: Kind = "mcap", *, n: int = 4, late: int = 0) -> Path:
+    """Write a bag of stereo pairs, camera, tool and gripper, and return its path."""
+    with RobotBag(path, kind) as bag:
+        bag.cameras(small_camera())
+        write_tool(bag, n)
+        write_images(bag, n, late=late)
+    return bag.path
+
+
+def points_table(n: int = 6, *, shift: float = 0.0) -> np.ndarray:
+    """Return points with numbers, in a layout with padding and the fields out of order."""
+    layout = np.dtype(
+        {
+            "names": ["id", "z", "x", "y"],
+            "formats": ["<u4", "<f4", "<f8", "<f4"],
+            "offsets": [2, 8, 16, 28],
+            "itemsize": 40,
+        }
+    )
+    table = np.zeros(n, layout)
+    table["id"] = 10 + np.arange(n)[::-1]
+    table["x"], table["y"], table["z"] = np.arange(n) + shift, 0.5, 0.25
+    return table

@@ -24,6 +24,8 @@ STORAGE_SUFFIXES = (".mcap", ".db3")
 """Suffixes of the files that a ROS 2 bag consists of."""
 ROS_ENCODINGS = ("cdr", "ros1")
 """Encodings of the messages of ROS 2 and ROS 1."""
+SQLITE_HEADER = 100
+"""Bytes of the header of an SQLite file."""
 SHOWN_REASON = 200
 """Characters of a library's own reason that a message shows."""
 
@@ -83,7 +85,10 @@ class Bag:
         self.path = path
         self._stack = ExitStack()
         with _refusing(path):
-            self._sources = [self._open(file) for file in _bag_files(path)]
+            files = _bag_files(path)
+            for file in files:
+                _refuse_cut_database(file)
+            self._sources = [self._open(file) for file in files]
 
     def __enter__(self) -> Self:
         return self
@@ -110,32 +115,31 @@ class Bag:
         """
         decoders = {name: _Decoder(self.path, self.topics[name]) for name in names}
         numbers: Counter[str] = Counter()
-        for source in self._sources:
-            raw = source.messages(set(names))
-            while True:
-                with _refusing(self.path):
-                    item = next(raw, None)
-                if item is None:
-                    break
-                name, received, data = item
-                content = decoders[name].decode(data)
-                yield BagMessage(topic=name, number=numbers[name], received=received, content=content)
-                numbers[name] += 1
+        for name, received, data in self.raw(names):
+            content = decoders[name].decode(data)
+            yield BagMessage(topic=name, number=numbers[name], received=received, content=content)
+            numbers[name] += 1
+        for name in names:
+            if numbers[name] != self.topics[name].count:
+                raise RecordingError(
+                    f"{self.path}: {name} has {numbers[name]} of the {self.topics[name].count} messages that the bag "
+                    "lists; was it cut off? (Without its metadata.yaml the files are read as they are.)"
+                )
 
-    def receipts(self, names: Collection[str]) -> Iterator[tuple[str, int]]:
-        """Yield topic and time of receipt [ns] of messages that need not be decoded.
+    def raw(self, names: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yield topic, time of receipt [ns] and data of the messages of some topics, in the order of the bag.
 
         Raises:
             RecordingError: the bag is damaged.
         """
         for source in self._sources if names else []:
-            raw = source.messages(set(names))
+            messages = source.messages(set(names))
             while True:
                 with _refusing(self.path):
-                    item = next(raw, None)
+                    item = next(messages, None)
                 if item is None:
                     break
-                yield item[0], item[1]
+                yield item
 
     def _open(self, file: Path) -> "_McapFile | _RosbagsFile":
         if file.suffix == ".mcap":
@@ -291,6 +295,24 @@ def _bag_files(path: Path) -> list[Path]:
             "(a .bag.active file was not closed: 'rosbag reindex' mends it)."
         )
     return [path]
+
+
+def _refuse_cut_database(path: Path) -> None:
+    """Refuse an SQLite file that is shorter than its header says; SQLite would read what is left without a word.
+
+    Header: https://www.sqlite.org/fileformat.html, section 1.3.
+
+    Raises:
+        RecordingError: it is shorter.
+    """
+    for file in path.glob("*.db3") if path.is_dir() else [path]:
+        if file.suffix == ".db3":
+            with open(file, "rb") as stream:
+                head = stream.read(SQLITE_HEADER)
+            page_size = int.from_bytes(head[16:18], "big")
+            wanted = (65536 if page_size == 1 else page_size) * int.from_bytes(head[28:32], "big")
+            if file.stat().st_size < max(wanted, SQLITE_HEADER):
+                raise RecordingError(f"{file} is cut off: {file.stat().st_size} of {wanted} bytes are there.")
 
 
 @contextmanager

@@ -234,8 +234,8 @@ def _rectify(
         right.K,
         right.D,
         (left.width, left.height),
-        T_right_left[:3, :3],
-        T_right_left[:3, 3],
+        np.ascontiguousarray(T_right_left[:3, :3]),
+        np.ascontiguousarray(T_right_left[:3, 3:]),
         flags=cv2.CALIB_ZERO_DISPARITY,
         alpha=0,
     )

@@ -123,7 +123,7 @@ def _times(bag: Bag) -> dict[str, _Found]:
         each.received.append(message.received)
         each.stamps.append(header_stamp(message.content))
         each.frames |= _frames(message.content)
-    for name, received in bag.receipts(set(bag.topics) - set(readable)):
+    for name, received, _ in bag.raw(set(bag.topics) - set(readable)):
         found[name].received.append(received)
     return found
 
