@@ -23,7 +23,7 @@ RATIO = 0.8
 def left_is_left(camera: StereoCamera, pair: StereoPair) -> bool | None:
     """Return whether the left image was taken by the camera on the left; None where the images do not tell."""
     left, right = (_rectified_grey(camera, side, image) for side, image in (("left", pair.left), ("right", pair.right)))
-    detector = cv2.SIFT_create(nfeatures=1000)
+    detector = cv2.SIFT.create(nfeatures=1000)
     points_left, described_left = detector.detectAndCompute(left, None)
     points_right, described_right = detector.detectAndCompute(right, None)
     if described_left is None or described_right is None or len(points_right) < 2:

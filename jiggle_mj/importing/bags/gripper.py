@@ -56,11 +56,7 @@ class ClosedRule:
         if text.strip() == ALWAYS:
             return cls(joint="", field="position", comparison=ALWAYS, limit=0.0)
         match = re.fullmatch(r"\s*([^<>=\s]+?)(?:\.(position|velocity|effort))?\s*(<=|>=|==|<|>)\s*(\S+)\s*", text)
-        value = {"true": "1", "false": "0"}.get(match[4].lower(), match[4]) if match else ""
-        try:
-            limit = float(value)
-        except ValueError:
-            match = None
+        limit = _number(match[4]) if match else np.nan
         if match is None or not np.isfinite(limit):
             raise OptionError(
                 "closed must be a comparison such as 'jaw<0.1', 'jaw.effort>0.2' or 'data==false', or the word "
@@ -167,3 +163,11 @@ def state_at(states: Sequence[JawState], time: int) -> JawState:
     """Return the latest state at a time [ns]; before the first message the jaws count as open."""
     place = bisect_right(states, time, key=lambda state: state.time)
     return states[place - 1] if place else JawState(time=time, closed=False)
+
+
+def _number(text: str) -> float:
+    """Return the number in a text, with true as 1 and false as 0; NaN where it is none."""
+    try:
+        return float({"true": "1", "false": "0"}.get(text.lower(), text))
+    except ValueError:
+        return np.nan

@@ -181,13 +181,13 @@ def _observation(prepared: Preparation, stamp: int, read: dict[Role, Any]) -> Ob
 
 def _read_frames(bag: Bag, prepared: Preparation) -> Iterator[tuple[FrameParts, dict[Role, Any]]]:
     """Yield each frame with its messages, in the order of time; keep only what a later frame needs."""
-    roles_of = {prepared.topic(role): role for frame in prepared.frames for role in frame.parts}
+    roles_of: dict[str, Role] = {prepared.topic(role): role for frame in prepared.frames for role in frame.parts}
     wanted = {(role, number) for frame in prepared.frames for role, number in frame.parts.items()}
     kept: dict[tuple[Role, int], Any] = {}
     coming = iter(prepared.frames)
     frame = next(coming, None)
     for message in bag.messages(list(roles_of)):
-        key = (roles_of[message.topic], message.number)
+        key: tuple[Role, int] = (roles_of[message.topic], message.number)
         if key in wanted:
             kept[key] = message.content
         while frame is not None and all(part in kept for part in frame.parts.items()):

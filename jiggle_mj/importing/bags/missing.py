@@ -9,7 +9,7 @@ from .gripper import ALWAYS
 from .roles import TYPES, RoleChoice
 from .settings import BagSettings, Role
 
-NEEDS = {
+NEEDS: dict[Role, str] = {
     "left": "a left image",
     "right": "a right image",
     "left_info": "the left camera's CameraInfo",
@@ -49,28 +49,25 @@ def missing_roles(
         unsure: candidates of roles that need the user's word.
         settings: what the user says.
     """
+    stereo = {"left", "right"} <= set(roles)
     needed: list[Role] = ["tool"]
+    found: list[str] = []
     if settings.closed is None or settings.closed.comparison != ALWAYS:
         needed.append("gripper")
-    by_camera = "left" in roles or "right" in roles or "left" in unsure or "right" in unsure
-    found: list[str] = []
-    if "points" in roles and not {"left", "right"} <= set(roles):
-        by_camera = False
-    elif "depth" in roles and not {"left", "right"} <= set(roles):
-        by_camera = False
+    if stereo or not {"points", "depth"} & set(roles):
+        if not {"left", "right"} & (set(roles) | set(unsure)):
+            found.append(
+                "images of both cameras (name them: --topic left=... --topic right=...), tracked points (--topic "
+                "points=...) or depth (--topic depth=...)"
+            )
+        else:
+            needed.extend(("left", "right"))
+        if "left" in roles and "left" not in settings.camera_info:
+            needed.append("left_info")
+        if "right" in roles and "right" not in settings.camera_info:
+            needed.append("right_info")
+    elif "points" not in roles:
         needed.append("depth_info")
-    elif by_camera:
-        needed += ["left", "right"]
-        needed += [
-            role
-            for role, side in (("left_info", "left"), ("right_info", "right"))
-            if side not in settings.camera_info and side in roles
-        ]
-    else:
-        found.append(
-            "images of both cameras (name them: --topic left=... --topic right=...), tracked points (--topic "
-            "points=...) or depth (--topic depth=...)"
-        )
     for role in needed:
         if role in roles:
             continue

@@ -14,7 +14,7 @@ from .calibration import CameraSource, parse_camera_info, read_camera_file, ster
 from .gripper import ALWAYS, JawState, jaw_states, jaw_value
 from .missing import missing_roles
 from .roles import RoleChoice, is_rectified
-from .settings import MS, BagSettings, Role
+from .settings import MS, BagSettings, Role, Side
 from .stamps import refuse_apart
 from .stereo_pairs import pair_images
 from .survey import BagSurvey, survey_bag
@@ -147,13 +147,14 @@ def _camera(
     notes: list[str],
 ) -> tuple[StereoCamera, bool]:
     sources: dict[Role, CameraSource] = {}
-    for role, info, side in (("left", "left_info", "left"), ("right", "right_info", "right")):
-        frame = survey.frame[role]
+    sides: tuple[tuple[Side, Role], ...] = (("left", "left_info"), ("right", "right_info"))
+    for side, info in sides:
+        frame = survey.frame[side]
         if side in settings.camera_info:
-            sources[role] = read_camera_file(settings.camera_info[side], frame)
+            sources[side] = read_camera_file(settings.camera_info[side], frame)
             continue
         messages, where = survey.messages[info], roles[info].topic
-        sources[role] = parse_camera_info(messages[0], where, frame or survey.frame[info])
+        sources[side] = parse_camera_info(messages[0], where, frame or survey.frame[info])
         if any(not _same_info(messages[0], other) for other in messages[1:]):
             notes.append(f"{where} changes during the bag (zoom or focus?); its first message is used")
     left, right, tree = sources["left"].frame, sources["right"].frame, survey.tree
@@ -261,8 +262,9 @@ def _forces(survey: BagSurvey) -> list[ToolForce]:
     times, found = survey.times["force"], []
     for number in times.order:
         message = survey.messages["force"][number]
-        wrench = message.wrench
-        force, torque = (tuple(float(getattr(each, axis)) for axis in "xyz") for each in (wrench.force, wrench.torque))
+        force, torque = (
+            (float(each.x), float(each.y), float(each.z)) for each in (message.wrench.force, message.wrench.torque)
+        )
         if np.isfinite([*force, *torque]).all():
             found.append(
                 ToolForce(time=times.stamps[number], force=force, torque=torque, frame_id=message.header.frame_id)

@@ -31,6 +31,8 @@ TYPES: dict[Role, tuple[str, ...]] = {
     "force": ("geometry_msgs/msg/WrenchStamped",),
 }
 """Types that a topic of each role may have."""
+IMAGE_OF: dict[Role, Role] = {"left_info": "left", "right_info": "right", "depth_info": "depth"}
+"""Role of the images that each CameraInfo describes."""
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 """Types of /tf and /tf_static."""
 LEFT_WORDS, RIGHT_WORDS = {"left", "l", "cam0", "camera0", "infra1"}, {"right", "r", "cam1", "camera1", "infra2"}
@@ -93,7 +95,9 @@ def choose_roles(
             chosen[role] = RoleChoice(topic=best[0], by_user=False)
         elif best:
             unsure[role] = best
-    for role, image in (("left_info", "left"), ("right_info", "right"), ("depth_info", "depth")):
+    if "left" in chosen and "right" in chosen and chosen["left"].topic == chosen["right"].topic:
+        raise RecordingError(f"{chosen['left'].topic} is named for both left and right; they are two cameras.")
+    for role, image in IMAGE_OF.items():
         if image not in chosen and role not in named:
             chosen.pop(role, None)
             unsure.pop(role, None)
@@ -147,7 +151,7 @@ def _rank(role: Role, topic: BagTopic) -> tuple[int, ...]:
 
 def _info_of(role: Role, infos: list[str], chosen: dict[Role, RoleChoice]) -> list[str]:
     """Return the CameraInfo of the image's namespace, or those that share its word for the side."""
-    image = chosen.get("left" if role == "left_info" else "right" if role == "right_info" else "depth")
+    image = chosen.get(IMAGE_OF[role])
     if image is None:
         return []
     parts = [part for part in image.topic.split("/") if part not in TRANSPORTS]
@@ -155,7 +159,7 @@ def _info_of(role: Role, infos: list[str], chosen: dict[Role, RoleChoice]) -> li
         beside = [name for name in infos if name == "/".join([*parts[:length], "camera_info"])]
         if beside:
             return beside
-    side = {"left_info": LEFT_WORDS, "right_info": RIGHT_WORDS, "depth_info": WORDS["depth"]}[role]
+    side = {"left": LEFT_WORDS, "right": RIGHT_WORDS, "depth": WORDS["depth"]}[IMAGE_OF[role]]
     return [name for name in infos if set(_words(name)) & side]
 
 
