@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jiggle_mj.actions import Cut, Suture
+from jiggle_mj.argument_checks import as_array, as_instance
 from jiggle_mj.camera import StereoCamera
-from jiggle_mj.errors import PerceptionError
+from jiggle_mj.errors import ObservationError, PerceptionError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
 from jiggle_mj.material import Material, material
 from jiggle_mj.observation import Declaration, Observation, ToolState
@@ -59,34 +60,34 @@ class Estimator:
             config: settings; the defaults are those that the figures of docs/RESULTS.md were made with.
             mask: which pixels are tissue; by colour if None.
             disparity: dense stereo; semi-global matching if None.
+
+        Raises:
+            OptionError: an argument is of another type.
         """
-        self.declaration, self.config = declaration, config or EstimatorConfig()
+        self.declaration = as_instance(declaration, "declaration", Declaration, hint="Declaration() has defaults.")
+        self.config = config = as_instance(config or EstimatorConfig(), "config", EstimatorConfig)
         self.skipped: list[tuple[int, str]] = []
         """Index and reason of each observation that could not be used."""
         self._perception = Perception(
-            declaration,
-            camera,
-            spacing=self.config.spacing,
-            config=self.config.perception,
-            mask=mask,
-            disparity=disparity,
+            declaration, camera, spacing=config.spacing, config=config.perception, mask=mask, disparity=disparity
         )
         self._grip = GripTracker()
         self._tracked_or_none: TrackedSheet | None = None
         self._open_frame: Observation | None = None
         self._tool: ToolState | None = None
         self._seen_precision = np.eye(3) * INITIAL_POINT_SD**-2
-        self._slip = 0.0
-        self._has_estimate = False
+        self._slip, self._has_estimate = 0.0, False
 
     def update(self, observation: Observation) -> Estimate | None:
         """Take one observation; return None if it only helps to fix the rest shape, or cannot be used.
 
         Raises:
+            ObservationError: this is no observation.
             PerceptionError: the sheet cannot be found in the first frames, or the first grasp is off the tissue. Once
                 there is an estimate, a frame that cannot be used goes to `skipped` instead.
             MeshError: the sheet at rest is folded, or not one sheet.
         """
+        as_instance(observation, "observation", Observation, hint="Iterate over a recording.", error=ObservationError)
         with jax.enable_x64(True), one_thread():
             try:
                 estimate = self._update(observation)
@@ -186,8 +187,7 @@ class Estimator:
             on_pass: called with each ratio's factor after each pass, for progress.
 
         Raises:
-            ValueError: asked before `begin` and before the first frame with closed jaws, or of another filter than
-                'implicit'.
+            ValueError: asked before `begin` and the first frame with closed jaws, or of another filter than 'implicit'.
         """
         filter = self._tracked.filter.by_forces("can identify the sheet")
         self.release()
@@ -238,9 +238,10 @@ class Estimator:
         It is that of the frames after this change and before the next; None if they hold no evidence.
 
         Raises:
-            ValueError: asked before `begin`, or of another filter than 'implicit'.
+            ValueError: asked before `begin`, or of another filter than 'implicit'; this is no change.
         """
         tracked = self._tracked
+        as_instance(change, "change", Change, hint="Estimator.changes lists them.")
         filter = tracked.filter.by_forces("can infer whether a cut or suture worked")
         with jax.enable_x64(True), one_thread():
             return filter.log_bayes_factor(tracked.state, change)
@@ -322,7 +323,7 @@ class Estimator:
 
     def force_unknown(self, held: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return the particles that a grip on the held ones may pull at, the held ones included."""
-        return self._tracked.field.dilated(held)
+        return self._tracked.field.dilated(as_array(held, "held", (len(self._tracked.x),), kind="booleans"))
 
     @property
     def _tracked(self) -> TrackedSheet:

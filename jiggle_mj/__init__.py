@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .errors import ClusterError as ClusterError
     from .errors import JiggleError as JiggleError
     from .errors import MeshError as MeshError
+    from .errors import ObservationError as ObservationError
     from .errors import OptionError as OptionError
     from .errors import OutputError as OutputError
     from .errors import PerceptionError as PerceptionError
@@ -81,6 +82,7 @@ __all__ = [
     "MeshError",
     "Move",
     "Observation",
+    "ObservationError",
     "OptionError",
     "OutputError",
     "PerceptionError",
@@ -121,6 +123,7 @@ _NAMES_OF_MODULE = {
         "ClusterError",
         "JiggleError",
         "MeshError",
+        "ObservationError",
         "OptionError",
         "OutputError",
         "PerceptionError",

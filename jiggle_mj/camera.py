@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from .errors import RecordingError
+from .argument_checks import as_array, as_instance, as_integer, as_number, store
+from .errors import ObservationError
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Transform from an OpenGL camera frame (y up, looking along -z; MuJoCo's) to an optical one; it is its own inverse."""
@@ -20,6 +21,10 @@ MAX_BASELINE_M = 1.0
 """Largest baseline [m]: a stereo endoscope has 4 mm, a stereo head over a table 0.3 m."""
 EQUAL_INTRINSICS = 1e-6
 """Largest relative and absolute [px] difference of equal rectified intrinsics: a calibration file rounds its digits."""
+
+
+ORTHONORMAL = 1e-3
+"""Largest difference of R^T R from the identity: calibration files print a rotation with few digits."""
 
 
 def rounded_quaternion(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
@@ -48,9 +53,24 @@ def optical_from_opengl(T_world_opengl: Float[np.ndarray, "4 4"]) -> Float[np.nd
     return T_world_opengl @ OPENCV_FROM_OPENGL
 
 
+def _check_rotation(R: Float[np.ndarray, "3 3"], where: str) -> None:
+    """Refuse a matrix that is no rotation.
+
+    Raises:
+        ObservationError: its columns are not of unit length and at right angles, or it mirrors.
+    """
+    if np.abs(R.T @ R - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(R) < 0:
+        raise ObservationError(f"{where} must be a rotation matrix; got {R.round(4).tolist()}.")
+
+
 @dataclass(frozen=True, kw_only=True)
 class CameraCalibration:
-    """Calibration of one camera of the pair, with the fields of `sensor_msgs/CameraInfo`."""
+    """Calibration of one camera of the pair, with the fields of `sensor_msgs/CameraInfo`.
+
+    Raises:
+        ObservationError: a size is not a whole number above 0, a matrix has another shape or numbers that are not
+            finite, a focal length is not above 0, or R is no rotation.
+    """
 
     width: int
     """Image width [px]."""
@@ -65,6 +85,19 @@ class CameraCalibration:
     R: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     """Rotation from the raw to the rectified optical frame."""
 
+    def __post_init__(self) -> None:
+        """Check sizes and matrices."""
+        name, error = "CameraCalibration", ObservationError
+        for size in ("width", "height"):
+            store(self, **{size: as_integer(getattr(self, size), f"{name}.{size} [px]", at_least=1, error=error)})
+        for matrix, shape in (("K", (3, 3)), ("P", (3, 4)), ("R", (3, 3)), ("D", (None,))):
+            store(self, **{matrix: as_array(getattr(self, matrix), f"{name}.{matrix}", shape, error=error)})
+        for matrix in ("K", "P"):
+            diagonal = getattr(self, matrix)[[0, 1], [0, 1]]
+            if not (diagonal > 0).all():
+                raise error(f"{name}.{matrix} must have focal lengths fx, fy above 0 px; got {diagonal.tolist()}.")
+        _check_rotation(self.R, f"{name}.R")
+
     @property
     def rectified(self) -> bool:
         """Return whether the raw image already is the rectified one."""
@@ -76,8 +109,8 @@ class StereoCamera:
     """Two calibrated cameras and the pose of the left one.
 
     Raises:
-        RecordingError: sizes or rectified intrinsics differ, or the right camera's P[0, 3] is not negative (swapped?),
-            or the baseline is beyond `MAX_BASELINE_M`.
+        ObservationError: sizes or rectified intrinsics differ, the right camera's P[0, 3] is not negative (swapped?), the
+            baseline is beyond `MAX_BASELINE_M`, or the pose is not a rigid transform of shape (4, 4).
     """
 
     left: CameraCalibration
@@ -88,26 +121,33 @@ class StereoCamera:
     """Transform from the left rectified optical frame to the world [m]."""
 
     def __post_init__(self) -> None:
-        """Check that the two calibrations belong together."""
+        """Check that the two calibrations belong together, and the pose."""
+        for side in ("left", "right"):
+            as_instance(getattr(self, side), f"StereoCamera.{side}", CameraCalibration, error=ObservationError)
+        T = as_array(self.T_world_camera, "StereoCamera.T_world_camera", (4, 4), error=ObservationError)
+        _check_rotation(T[:3, :3], "StereoCamera.T_world_camera[:3, :3]")
+        if not np.array_equal(T[3], [0, 0, 0, 1]):
+            raise ObservationError(f"StereoCamera.T_world_camera must end in the row 0 0 0 1; got {T[3].tolist()}.")
+        store(self, T_world_camera=T)
         sizes = [(c.width, c.height) for c in (self.left, self.right)]
         if sizes[0] != sizes[1]:
-            raise RecordingError(
+            raise ObservationError(
                 f"camera_info sizes differ: left {sizes[0]}, right {sizes[1]}; both must be one rectified size."
             )
         if not self.baseline > 0:
-            raise RecordingError(
+            raise ObservationError(
                 f"right camera_info has P[0,3] = {self.right.P[0, 3]:.6g}; it must be -fx*baseline, below zero "
                 "(are the cameras swapped, or is the calibration monocular?)."
             )
         if self.baseline > MAX_BASELINE_M:
-            raise RecordingError(
+            raise ObservationError(
                 f"the baseline is {self.baseline:.4g} m (right camera_info P[0,3] = {self.right.P[0, 3]:.6g}); at most "
                 f"{MAX_BASELINE_M:g} m are read (is it in millimetres? then it is {self.baseline / 1e3:.4g} m)."
             )
         if self.left.P[0, 3] != 0 or not np.allclose(
             self.left.P[:, :3], self.right.P[:, :3], rtol=EQUAL_INTRINSICS, atol=EQUAL_INTRINSICS
         ):
-            raise RecordingError(
+            raise ObservationError(
                 f"the rectified cameras differ: left P = {self.left.P.tolist()}, right P = {self.right.P.tolist()}; "
                 "all but the right P[0,3] must be equal (rectify with OpenCV's CALIB_ZERO_DISPARITY)."
             )
@@ -124,7 +164,16 @@ class StereoCamera:
             focal: focal length [px].
             baseline: distance between the two centres of projection [m].
             T_world_camera: left optical frame to world [m].
+
+        Raises:
+            ObservationError: a size, the focal length or the baseline is not above 0, or the pose is not a rigid
+                transform.
         """
+        name, error = "StereoCamera.rectified", ObservationError
+        focal = as_number(focal, f"{name}: focal", unit="px", above=0, error=error)
+        baseline = as_number(baseline, f"{name}: baseline", unit="m", above=0, error=error)
+        width = as_integer(width, f"{name}: width [px]", at_least=1, error=error)
+        height = as_integer(height, f"{name}: height [px]", at_least=1, error=error)
         K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
         left, right = np.hstack([K, np.zeros((3, 1))]), np.hstack([K, [[-focal * baseline], [0], [0]]])
         return cls(

@@ -16,6 +16,10 @@ class RecordingError(JiggleError):
     """A recording or a folder of measured data is missing, malformed, foreign or holds truth."""
 
 
+class ObservationError(RecordingError, ValueError):
+    """A part of an observation, a camera or a declared mesh has the wrong type, shape or range."""
+
+
 class PerceptionError(JiggleError):
     """The images cannot be used: no tissue in view, cameras swapped, sizes that differ."""
 
@@ -24,8 +28,8 @@ class MeshError(JiggleError):
     """A mesh is degenerate, inverted or in several pieces."""
 
 
-class ActionError(JiggleError):
-    """The tissue cannot do what an action asks: a grasp off it or while grasping, a release of nothing."""
+class ActionError(JiggleError, ValueError):
+    """An action is impossible: a number that is not finite, a grasp off the tissue, a release of nothing."""
 
 
 class RenderError(JiggleError):

@@ -9,7 +9,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from .actions import Cut, Suture
-from .errors import RecordingError
+from .argument_checks import (
+    as_array,
+    as_flag,
+    as_instance,
+    as_integer,
+    as_number,
+    as_tuple_of,
+    quoted,
+    store,
+)
+from .errors import ObservationError, OptionError
 
 IDENTITY_WXYZ = np.array([1.0, 0.0, 0.0, 0.0])
 """Quaternion wxyz of the identity rotation."""
@@ -20,7 +30,7 @@ class StereoPair:
     """One raw image from each camera, taken at the same time.
 
     Raises:
-        RecordingError: the two sizes differ.
+        ObservationError: an image is not of type uint8 and shape (height, width, 3), is empty, or the two sizes differ.
     """
 
     left: UInt8[np.ndarray, "height width 3"]
@@ -29,9 +39,15 @@ class StereoPair:
     """RGB image of the right camera, of the same size."""
 
     def __post_init__(self) -> None:
-        """Check that the two images have one size."""
+        """Check that the two are RGB images of one size."""
+        for side in ("left", "right"):
+            where, shape = f"StereoPair.{side}", (None, None, 3)
+            image = as_array(getattr(self, side), where, shape, kind="uint8", error=ObservationError)
+            if not image.size:
+                raise ObservationError(f"{where} is empty: {image.shape}.")
+            store(self, **{side: image})
         if self.left.shape != self.right.shape:
-            raise RecordingError(f"stereo images differ in size: left {self.left.shape}, right {self.right.shape}.")
+            raise ObservationError(f"stereo images differ in size: left {self.left.shape}, right {self.right.shape}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,25 +55,39 @@ class MeasuredPoints:
     """Points measured on the tissue.
 
     Raises:
-        RecordingError: the standard deviation is not finite and above 0.
+        ObservationError: positions are no numbers of shape (m, 3), there is not one track id for each, an id of 0 or
+            above repeats, or the standard deviation is not finite and above 0.
     """
 
     positions: Float[np.ndarray, "m 3"]
     """Positions in the world frame [m]; NaN for a point that is not seen."""
     track_id: Int[np.ndarray, " m"] | None = None
-    """Number of the material point, the same in every frame; None for clouds without correspondence."""
+    """Number of the material point, the same in every frame; negative for a point that is not used; None for clouds
+    without correspondence."""
     sd: float = 2e-4
     """Standard deviation of each coordinate's noise [m]."""
 
     def __post_init__(self) -> None:
-        """Check the noise."""
-        if not (np.isfinite(self.sd) and self.sd > 0):
-            raise RecordingError(f"the points' sd is {self.sd} m; it must be above 0 and finite.")
+        """Check positions, identities and noise."""
+        name = "MeasuredPoints"
+        positions = as_array(self.positions, f"{name}.positions [m]", (None, 3), finite=False, error=ObservationError)
+        store(
+            self,
+            positions=positions,
+            sd=as_number(self.sd, f"{name}.sd", unit="m", above=0, error=ObservationError),
+        )
+        if self.track_id is not None:
+            store(self, track_id=_track_ids(self.track_id, f"{name}.track_id", len(positions)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ToolState:
-    """The tweezer as the robot reports it."""
+    """The tweezer as the robot reports it.
+
+    Raises:
+        ObservationError: a field has the wrong type or shape, a number is not finite, the quaternion is zero, the
+            radius is not above 0, or the number of the grasp is below 0.
+    """
 
     position: Float[np.ndarray, " 3"]
     """Position of the tip in the world frame [m]."""
@@ -74,20 +104,54 @@ class ToolState:
     by_points: bool = False
     """Whether `position` is the mean of the held points, and so no independent measurement."""
 
+    def __post_init__(self) -> None:
+        """Check every field."""
+        error = ObservationError
+        quat_wxyz = as_array(self.quat_wxyz, "ToolState.quat_wxyz", (4,), error=error)
+        if not quat_wxyz.any():
+            raise error("ToolState.quat_wxyz must not be zero: the identity is [1, 0, 0, 0].")
+        held = self.held_tracks.tolist() if isinstance(self.held_tracks, np.ndarray) else self.held_tracks
+        store(
+            self,
+            position=as_array(self.position, "ToolState.position [m]", (3,), error=error),
+            quat_wxyz=quat_wxyz,
+            closed=as_flag(self.closed, "ToolState.closed", error=error),
+            grasp=as_integer(self.grasp, "ToolState.grasp", at_least=0, error=error),
+            radius=as_number(self.radius, "ToolState.radius", unit="m", above=0, error=error),
+            held_tracks=tuple(map(int, as_tuple_of(held, "ToolState.held_tracks", (int, np.integer), error=error))),
+            by_points=as_flag(self.by_points, "ToolState.by_points", error=error),
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class ToolReport:
-    """The robot's report of the tip position between two observations."""
+    """The robot's report of the tip position between two observations.
+
+    Raises:
+        ObservationError: the time is no integer, or the position is not three finite numbers.
+    """
 
     time: int
     """Time on the clock of `Observation.time` [ns]."""
     position: Float[np.ndarray, " 3"]
     """Position of the tip in the world frame [m]."""
 
+    def __post_init__(self) -> None:
+        """Check time and position."""
+        store(
+            self,
+            time=as_integer(self.time, "ToolReport.time [ns]", error=ObservationError),
+            position=as_array(self.position, "ToolReport.position [m]", (3,), error=ObservationError),
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """The tool, and images or measured points, at one time; where there are both, the estimator uses the images."""
+    """The tool, and images or measured points, at one time; where there are both, the estimator uses the images.
+
+    Raises:
+        ObservationError: a field is of another type than stated, or the index is below 0.
+    """
 
     index: int
     """Position in the recording, skipped frames counted."""
@@ -104,6 +168,22 @@ class Observation:
     events: tuple[Cut | Suture, ...] = ()
     """Intended cuts and sutures since the observation before."""
 
+    def __post_init__(self) -> None:
+        """Check the type of every field."""
+        error = ObservationError
+        as_instance(self.tool, "Observation.tool", ToolState, error=error)
+        if self.images is not None:
+            as_instance(self.images, "Observation.images", StereoPair, error=error)
+        if self.points is not None:
+            as_instance(self.points, "Observation.points", MeasuredPoints, error=error)
+        store(
+            self,
+            index=as_integer(self.index, "Observation.index", at_least=0, error=error),
+            time=as_integer(self.time, "Observation.time [ns]", error=error),
+            reports=as_tuple_of(self.reports, "Observation.reports", ToolReport, error=error),
+            events=as_tuple_of(self.events, "Observation.events", (Cut, Suture), error=error),
+        )
+
     @property
     def lost(self) -> bool:
         """Return whether the frame never came: it has neither images nor points, and the next frame has its index."""
@@ -112,7 +192,12 @@ class Observation:
 
 @dataclass(frozen=True, kw_only=True)
 class DeclaredMesh:
-    """A mesh that the user declares for imported data; it may reach beyond the view."""
+    """A mesh that the user declares for imported data; it may reach beyond the view.
+
+    Raises:
+        ObservationError: a field has the wrong type or shape, a vertex is not finite, a triangle names a vertex that
+            there is not, or a track id of 0 or above repeats.
+    """
 
     vertices: Float[np.ndarray, "n 3"]
     """Rest positions in the world frame [m]."""
@@ -123,12 +208,31 @@ class DeclaredMesh:
     held: Bool[np.ndarray, " n"] | None = None
     """Which vertices the jaws hold, where the tool's radius cannot tell; if None, the radius decides."""
 
+    def __post_init__(self) -> None:
+        """Check shapes and vertex numbers."""
+        name, error = "DeclaredMesh", ObservationError
+        vertices = as_array(self.vertices, f"{name}.vertices [m]", (None, 3), error=error)
+        faces = as_array(self.faces, f"{name}.faces", (None, 3), kind="whole numbers", error=error)
+        outside = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
+        if outside.size:
+            raise error(
+                f"{name}.faces[{outside[0]}] is {faces[outside[0]].tolist()}; vertex numbers must lie in "
+                f"0..{len(vertices) - 1}, counted from 0."
+            )
+        store(self, vertices=vertices, faces=faces)
+        store(self, track_id=_track_ids(self.track_id, f"{name}.track_id", len(vertices)))
+        if self.held is not None:
+            store(self, held=as_array(self.held, f"{name}.held", (len(vertices),), kind="booleans", error=error))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Declaration:
     """The user's prior knowledge of the tissue. It is not the truth: it may be wrong.
 
     Positions alone give stiffness ratios only; `membrane_stiffness` converts them to N/m.
+
+    Raises:
+        OptionError: a number is not finite or out of its range, or a field is of another type.
     """
 
     membrane_stiffness: float = 30.0
@@ -154,12 +258,29 @@ class Declaration:
         return not self.bed and any(self.gravity)
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in ("membrane_stiffness", "thickness", "areal_density"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"Declaration.{name} must be above 0; got {getattr(self, name)}.")
-        if not 0 <= self.poisson < 0.5:
-            raise ValueError(
-                f"Declaration.poisson must be in [0, 0.5) for a shell; got {self.poisson} "
+        """Check types and ranges."""
+        for name, unit in (("membrane_stiffness", "N/m"), ("thickness", "m"), ("areal_density", "kg/m^2")):
+            store(self, **{name: as_number(getattr(self, name), f"Declaration.{name}", unit=unit, above=0)})
+        poisson = as_number(self.poisson, "Declaration.poisson")
+        if not 0 <= poisson < 0.5:
+            raise OptionError(
+                f"Declaration.poisson must be in [0, 0.5) for a shell; got {quoted(self.poisson)} "
                 "(use 0.49 for nearly incompressible tissue)."
             )
+        gravity = as_array(self.gravity, "Declaration.gravity [m/s^2]", (3,))
+        store(self, poisson=poisson, gravity=tuple(gravity.tolist()), bed=as_flag(self.bed, "Declaration.bed"))
+        if self.mesh is not None:
+            as_instance(self.mesh, "Declaration.mesh", DeclaredMesh)
+
+
+def _track_ids(value: object, where: str, count: int) -> Int[np.ndarray, " m"]:
+    """Return one track id for each of `count` points; refuse an id of 0 or above that repeats."""
+    ids = as_array(value, where, (count,), kind="whole numbers", error=ObservationError)
+    used = np.sort(ids[ids >= 0])
+    repeated = used[1:][used[1:] == used[:-1]]
+    if repeated.size:
+        raise ObservationError(
+            f"{where} names point {repeated[0]} twice; each id of 0 or above may stand once in a frame, and -1 stands "
+            "for a point that is not used."
+        )
+    return ids

@@ -5,6 +5,7 @@ state but the tool's reported pose and what the chosen sensing shows.
 """
 
 import math
+import os
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -14,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jiggle_mj.actions import Action, Cut, Grasp, Move, Release, Suture, Wait
+from jiggle_mj.argument_checks import as_choice, as_instance, as_integer, quoted
 from jiggle_mj.camera import StereoCamera
-from jiggle_mj.errors import ActionError, SceneError
+from jiggle_mj.errors import ActionError
 from jiggle_mj.observation import Declaration, Observation, ToolState
 from jiggle_mj.options import SENSING, Sensing
 from jiggle_mj.truth import Truth, TruthFrame
@@ -44,9 +46,15 @@ MIN_WAIT_STEPS = 5
 class Reference:
     """A tissue that can be grasped, lifted, cut, sewn and observed.
 
+    Args:
+        scene: of `load_scene`, or constructed.
+        seed: seed of the sensing noise.
+        sensing: what an observation holds.
+        dump_dir: folder for the state of a simulation that becomes unstable.
+
     Raises:
-        SceneError: the scene is impossible, or the seed is below 0.
-        ValueError: `sensing` is not one of `SENSING`.
+        OptionError: an argument has the wrong type, the seed is below 0, or `sensing` is not one of `SENSING`.
+        SceneError: the scene is impossible.
         RenderError: `sensing="stereo"`, and this machine has no offscreen OpenGL.
     """
 
@@ -58,11 +66,11 @@ class Reference:
         sensing: Sensing,
         dump_dir: Path | None = None,
     ) -> None:
-        if sensing not in SENSING:
-            raise ValueError(f"sensing = {sensing!r}: must be one of {', '.join(map(repr, SENSING))}.")
-        if seed < 0:
-            raise SceneError(f"seed = {seed}: must be an integer of at least 0.")
-        self.scene, self.sensing = scene, sensing
+        self.scene = as_instance(scene, "scene", Scene, hint="load_scene(NAME) reads one.")
+        self.sensing: Sensing = as_choice(sensing, "sensing", SENSING)
+        seed = as_integer(seed, "seed", at_least=0)
+        if dump_dir is not None:
+            dump_dir = Path(as_instance(dump_dir, "dump_dir", os.PathLike, hint="Path(TEXT) makes one."))
         self.simulation = Simulation(scene, drawn=sensing == "stereo", dump_dir=dump_dir)
         """Truth: MuJoCo's state behind the experiment, for tests of the reference. An estimator must not read it."""
         noise = np.random.default_rng([scene.seed, seed])
@@ -101,7 +109,7 @@ class Reference:
 
         Raises:
             ActionError: a grasp off the tissue or during a grasp, a release without a grasp, a cut or suture off the
-                tissue, or a number that is not finite or out of range.
+                tissue, a number out of range, or something that is no action.
             SimulationError: the tissue became unstable.
         """
         match action:
@@ -118,7 +126,7 @@ class Reference:
             case Wait():
                 pass
             case _:
-                raise ActionError(f"step takes a Grasp, Move, Release, Wait, Cut or Suture; got {action!r}.")
+                raise ActionError(f"step takes a Grasp, Move, Release, Wait, Cut or Suture; got {quoted(action)}.")
         settled = self._wait() if isinstance(action, Wait) else self._settle(after_move=isinstance(action, Move))
         view = self.observer.look()
         if view is None:
@@ -186,9 +194,9 @@ class Reference:
     def _close(self, action: Grasp) -> None:
         if self._closed:
             raise ActionError(f"grasp at {_text(action.point)} while grasp {self._grasp} holds: release it first.")
-        point = _finite(action.point, name="Grasp.point")
-        if not 0 < action.radius <= MAX_GRASP_RADIUS:
-            raise ActionError(f"Grasp.radius must be above 0 m and at most {MAX_GRASP_RADIUS} m; got {action.radius}.")
+        point = action.point
+        if action.radius > MAX_GRASP_RADIUS:
+            raise ActionError(f"Grasp.radius must be at most {MAX_GRASP_RADIUS} m; got {action.radius:g}.")
         distance = np.linalg.norm(self.simulation.surface() - point, axis=1)
         inside = distance <= action.radius
         if not inside.any():
@@ -205,7 +213,7 @@ class Reference:
         self.simulation.jaws.tip = self._above_bed(point)
         self.simulation.jaws.close(np.flatnonzero(inside))
         self.observer.jaws_closed()
-        self._grasp, self._radius, self._closed = self._grasp + 1, float(action.radius), True
+        self._grasp, self._radius, self._closed = self._grasp + 1, action.radius, True
 
     def _open(self) -> None:
         if not self._closed:
@@ -214,7 +222,7 @@ class Reference:
         self._closed = False
 
     def _move(self, action: Move) -> None:
-        to = _finite(action.to, name="Move.to")
+        to = action.to
         lowest = -MAX_DEPTH if self.scene.bed.present else -MAX_REACH
         if np.abs(to).max() > MAX_REACH or to[2] < lowest:
             raise ActionError(
@@ -269,13 +277,6 @@ class Reference:
             grasp=self._grasp,
             radius=self._radius,
         )
-
-
-def _finite(point: Float[np.ndarray, " 3"], *, name: str) -> Float[np.ndarray, " 3"]:
-    values = np.array(point, dtype=float)
-    if values.shape != (3,) or not np.isfinite(values).all():
-        raise ActionError(f"{name} must be three finite numbers in m; got {point}.")
-    return values
 
 
 def _text(point: Float[np.ndarray, " 3"]) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
+from jiggle_mj.argument_checks import as_function, as_instance
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
@@ -48,7 +49,15 @@ class Perception:
             mask: segmentation of tissue; by colour if None.
             disparity: dense stereo; semi-global matching if None.
             config: settings of the trackers; the defaults if None.
+
+        Raises:
+            OptionError: an argument is of another type.
         """
+        if camera is not None:
+            as_instance(camera, "camera", StereoCamera, hint="Recording.camera and Reference.camera are such.")
+        for name, function in (("mask", mask), ("disparity", disparity)):
+            if function is not None:
+                as_function(function, name)
         self._declaration, self._spacing, self._config = declaration, spacing, config or PerceptionConfig()
         self._stereo = (
             None

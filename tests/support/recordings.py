@@ -54,6 +54,14 @@ def tool(*, x: float = 0.1, held: tuple[int, ...] = ()) -> ToolState:
     )
 
 
+def malformed(state: ToolState, **changes: object) -> ToolState:
+    """A state that `ToolState` itself would refuse, as a broken robot may report it."""
+    broken = replace(state)
+    for name, value in changes.items():
+        object.__setattr__(broken, name, value)
+    return broken
+
+
 def image(seed: int, *, height: int = 24, width: int = 32) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 

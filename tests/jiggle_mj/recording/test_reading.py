@@ -26,7 +26,7 @@ from jiggle_mj.recording.schemas import (
     pose_message,
 )
 from jiggle_mj.recording.topics import GRASP, LEFT, POINTS, POSE, RIGHT, TF
-from tests.support.recordings import MS, ROUNDING, Bag, camera, image, read_all, tool
+from tests.support.recordings import MS, ROUNDING, Bag, camera, image, malformed, read_all, tool
 
 JPEG_LOSS = 3
 """Largest difference of a grey value that JPEG may make in a flat image."""
@@ -56,7 +56,7 @@ def test_the_noise_of_points_is_that_of_those_seen_and_must_be_one_positive_numb
     (kept,) = recording
     assert kept.points.sd == 1e-3
     (_, zero_sd), (_, two_sds) = recording.skipped
-    assert "sd is 0.0 m; it must be above 0" in zero_sd and "from 0.001 to 0.002" in two_sds
+    assert "sd must be above 0 and finite, in m; got 0.0" in zero_sd and "from 0.001 to 0.002" in two_sds
 
 
 def test_frames_that_fail_a_check_are_named_and_skipped(tmp_path):
@@ -79,7 +79,7 @@ def test_frames_that_fail_a_check_are_named_and_skipped(tmp_path):
     bag.tool(time)
     bag.image(RIGHT, time, image(0))
     time = next_time(3, "NaN in the pose")
-    bag.tool(time, replace(tool(), position=np.array([np.nan, 0, 0])))
+    bag.tool(time, malformed(tool(), position=np.array([np.nan, 0, 0])))
     bag.pair(time)
     time = next_time(4, "/camera/right/image_raw is 20x24 and its calibration 32x24")
     bag.tool(time)
@@ -114,7 +114,7 @@ def test_stamps_within_the_tolerance_make_one_frame(tmp_path):
     bag = Bag(tmp_path / "run.mcap", cameras=camera())
     for k in range(3):
         time = start + k * 100 * MS
-        bag.points(time - 3 * MS, track_id=np.array([k, 1, 2], np.uint32))
+        bag.points(time - 3 * MS, track_id=np.array([k, 11, 12], np.uint32))
         bag.image(LEFT, time, image(k))
         bag.tool(time + 2 * MS, tool(x=float(k)))
         bag.image(RIGHT, time + 4 * MS, image(10 + k))
@@ -206,7 +206,7 @@ def test_a_cloud_without_z_is_skipped_by_name(tmp_path):
 def test_reports_during_an_unusable_frame_go_to_the_next_one(tmp_path):
     bag = Bag(tmp_path / "run.mcap")
     for time, x in ((0, 0.0), (40, 1.0), (100, 2.0), (140, np.nan), (160, 3.0), (200, 4.0)):
-        state = replace(tool(), position=np.array([x, 0.0, 0.0]))
+        state = malformed(tool(), position=np.array([x, 0.0, 0.0]))
         bag.tool(time * MS, state)
         if time in (0, 200):
             bag.points(time * MS)
