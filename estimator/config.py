@@ -1,8 +1,10 @@
 """The estimator's settings, and the ranges that they may have."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Literal, get_args
 
+from jiggle_mj.argument_checks import as_choice, as_instance, as_integer, as_number, store
+from jiggle_mj.errors import OptionError
 from jiggle_mj.options import FilterName
 
 from .belief.config import BeliefConfig
@@ -33,7 +35,11 @@ to it."""
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorConfig:
-    """Settings of the estimator; stiffnesses are shares of the declared membrane stiffness k."""
+    """Settings of the estimator; stiffnesses are shares of the declared membrane stiffness k.
+
+    Raises:
+        OptionError: a setting is of another type, or out of its range.
+    """
 
     spacing: float = 4.4e-3
     """Distance between the particles of a mesh laid over images [m]."""
@@ -78,26 +84,24 @@ class EstimatorConfig:
     """Numbers of the belief of the filter 'implicit', and of its sampler."""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in POSITIVE:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"EstimatorConfig.{name} must be above 0; got {getattr(self, name)}.")
-        for name in SHARES:
-            share = getattr(self, name)
+        """Check types and ranges."""
+        name = type(self).__name__
+        for setting in POSITIVE:
+            store(self, **{setting: as_number(getattr(self, setting), f"{name}.{setting}", above=0)})
+        for setting in SHARES:
+            share = getattr(self, setting)
             if not 1 / LARGEST_RATIO <= share <= LARGEST_RATIO:
-                raise ValueError(
-                    f"EstimatorConfig.{name} is a share of the membrane stiffness and must lie between "
+                raise OptionError(
+                    f"{name}.{setting} is a share of the membrane stiffness and must lie between "
                     f"{1 / LARGEST_RATIO:g} and {LARGEST_RATIO:g}, what float32 can add to it; got {share}."
                 )
-        if self.filter not in get_args(FilterName):
-            raise ValueError(f"EstimatorConfig.filter must be one of {get_args(FilterName)}; got {self.filter!r}.")
-        if self.refinement not in get_args(Refinement):
-            raise ValueError(
-                f"EstimatorConfig.refinement must be one of {get_args(Refinement)}; got {self.refinement!r}."
-            )
-        if not (isinstance(self.samples, int) and self.samples >= 1):
-            raise ValueError(f"EstimatorConfig.samples must be an integer of at least 1; got {self.samples}.")
-        if not (isinstance(self.seed, int) and self.seed >= 0):
-            raise ValueError(f"EstimatorConfig.seed must be an integer of at least 0; got {self.seed}.")
-        if self.membrane not in get_args(Membrane):
-            raise ValueError(f"EstimatorConfig.membrane must be one of {get_args(Membrane)}; got {self.membrane!r}.")
+        for setting, among in (("filter", FilterName), ("refinement", Refinement), ("membrane", Membrane)):
+            as_choice(getattr(self, setting), f"{name}.{setting}", get_args(among))
+        store(
+            self,
+            samples=as_integer(self.samples, f"{name}.samples", at_least=1),
+            seed=as_integer(self.seed, f"{name}.seed", at_least=0),
+        )
+        for setting in fields(self):
+            if isinstance(setting.type, type) and is_dataclass(setting.type):
+                as_instance(getattr(self, setting.name), f"{name}.{setting.name}", setting.type)

@@ -5,8 +5,10 @@ constructors check what they are given. No check copies an array that is right a
 """
 
 import math
+import os
 from collections.abc import Callable
 from operator import index
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -182,6 +184,17 @@ def as_tuple_of(
     if not isinstance(value, list | tuple) or not all(isinstance(entry, classes) for entry in value):
         raise error(f"{where} must be a tuple of {names}; got {quoted(value)}.")
     return tuple(value)
+
+
+def as_path(value: object, where: str, *, error: type[JiggleError] = OptionError) -> Path:
+    """Return a path that is given as a text or a path.
+
+    Raises:
+        JiggleError: `error`, where it is something else.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise error(f"{where} must be a path; got {quoted(value)}.")
+    return Path(value)
 
 
 def as_function(value: object, where: str, *, error: type[JiggleError] = OptionError) -> Callable[..., Any]:

@@ -109,8 +109,8 @@ class StereoCamera:
     """Two calibrated cameras and the pose of the left one.
 
     Raises:
-        ObservationError: sizes or rectified intrinsics differ, the right camera's P[0, 3] is not negative (swapped?), the
-            baseline is beyond `MAX_BASELINE_M`, or the pose is not a rigid transform of shape (4, 4).
+        ObservationError: sizes or rectified intrinsics differ, the right camera's P[0, 3] is not negative (swapped?),
+            the baseline is beyond `MAX_BASELINE_M`, or the pose is not a rigid transform of shape (4, 4).
     """
 
     left: CameraCalibration

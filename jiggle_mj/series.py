@@ -17,12 +17,13 @@ from queue import SimpleQueue
 
 from mcap.records import Metadata
 
-from jiggle_mj.options import Sensing
+from jiggle_mj.options import SENSING, Sensing
 from jiggle_mj.scenes import Reference, Scene, programme
 
+from .argument_checks import as_choice, as_instance, as_integer, as_path
 from .cluster import died_with_its_worker
 from .episode import check_directory, clear_directory, observe, recording_identity
-from .errors import OptionError, OutputError, RecordingError, SimulationError
+from .errors import OutputError, RecordingError, SimulationError
 from .recording.declaration import METADATA
 from .recording.mcap_files import iterate_records, truth_path
 from .recording.truth import salt
@@ -93,16 +94,17 @@ def record_series(
         The recordings that exist, and the reasons for those that failed.
 
     Raises:
-        OptionError: fewer than one recording, or a seed below 0.
+        OptionError: fewer than one recording, a seed below 0, or an argument of another type.
         OutputError: the folder cannot be used, or holds other recordings under these names.
         JiggleError: every recording would fail: the scene is impossible, no OpenGL. Complete recordings stay.
         KeyboardInterrupt: recordings that have not begun are cancelled; complete ones stay.
     """
-    folder = Path(folder)
-    if count < 1:
-        raise OptionError(f"count = {count}: must be at least 1.")
-    if seed < 0:
-        raise OptionError(f"seed = {seed}: must be an integer of at least 0.")
+    as_instance(scene, "scene", Scene, hint="load_scene(NAME) reads one.")
+    as_choice(sensing, "sensing", SENSING)
+    folder = as_path(folder, "folder")
+    count, seed = as_integer(count, "count", at_least=1), as_integer(seed, "seed", at_least=0)
+    if executor is not None:
+        as_instance(executor, "executor", Executor, hint="WorkerProcesses() is one.")
     orders = [
         _Order(scene=scene, sensing=sensing, seed=each, path=(folder / f"{each:06d}.mcap").absolute())
         for each in range(seed, seed + count)

@@ -18,7 +18,7 @@ from queue import LifoQueue
 from types import TracebackType
 from typing import Any, TypeVar
 
-from .errors import OptionError
+from .argument_checks import as_integer
 
 T = TypeVar("T")
 SPAWN = multiprocessing.get_context("spawn")
@@ -39,13 +39,11 @@ class WorkerProcesses(Executor):
         count: largest number of processes; None for one on each usable core.
 
     Raises:
-        OptionError: count is below 1.
+        OptionError: count is no integer of at least 1.
     """
 
     def __init__(self, count: int | None = None) -> None:
-        if count is not None and count < 1:
-            raise OptionError(f"jobs = {count}: must be at least 1.")
-        count = count or usable_cores()
+        count = usable_cores() if count is None else as_integer(count, "jobs", at_least=1)
         self._workers = [_Worker() for _ in range(count)]
         self._idle: LifoQueue[_Worker] = LifoQueue()
         for worker in self._workers:

@@ -11,7 +11,9 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
+from jiggle_mj.argument_checks import as_path
 from jiggle_mj.errors import SceneError
+from jiggle_mj.likely_name import did_you_mean
 from jiggle_mj.toml_kinds import MAX_SHOWN, shown
 
 from .disturbances.registry import disturbance_class
@@ -67,13 +69,14 @@ def load_scene(name_or_path: str | Path) -> Scene:
     Raises:
         SceneError: no such scene, not TOML, or a key or value that is not allowed.
     """
-    path = Path(name_or_path)
+    path = as_path(name_or_path, "a scene's name or path", error=SceneError)
     if str(name_or_path) in shipped_scenes():
         path = SHIPPED_FOLDER / f"{name_or_path}.toml"
     elif path.suffix != ".toml":
+        name = str(name_or_path)
         raise SceneError(
-            f"no scene named {str(name_or_path)!r}; shipped scenes are {', '.join(shipped_scenes())}, "
-            "and the path of a scene file ends in .toml."
+            f"no scene named {name!r}{did_you_mean(name, shipped_scenes())}; shipped scenes are "
+            f"{', '.join(shipped_scenes())}, and the path of a scene file ends in .toml."
         )
     try:
         text = path.read_text(encoding="utf-8")
@@ -120,7 +123,8 @@ def _tables(table: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, An
 def _attachment(table: dict[str, Any], *, where: str) -> Attachment:
     shape = table.get("shape")
     if not isinstance(shape, str) or shape not in SHAPES:
-        raise SceneError(f"{where}.shape = {shown(shape)}: must be one of {', '.join(map(repr, SHAPES))}.")
+        hint = did_you_mean(shape, SHAPES)
+        raise SceneError(f"{where}.shape = {shown(shape)}{hint}: must be one of {', '.join(map(repr, SHAPES))}.")
     return _section(SHAPES[shape], {k: v for k, v in table.items() if k != "shape"}, where=where)
 
 
@@ -144,7 +148,8 @@ def _section(cls: type[Section], table: object, *, where: str) -> Any:
 def _refuse_unknown(table: dict[str, Any], known: list[str], *, where: str) -> None:
     unknown = [key for key in table if key not in known]
     if unknown:
-        raise SceneError(f"unknown key {shown(unknown[0])} in {where}; known keys are {', '.join(known)}.")
+        hint = did_you_mean(unknown[0], known)
+        raise SceneError(f"unknown key {shown(unknown[0])} in {where}{hint}; known keys are {', '.join(known)}.")
 
 
 def scene_table(scene: Scene) -> dict[str, Any]:

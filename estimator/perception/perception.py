@@ -111,8 +111,13 @@ class Perception:
         """Return the time of the rest shape [ns]: the mean over the frames that it is the mean of.
 
         The time of a declared mesh is that of the first frame.
+
+        Raises:
+            PerceptionError: no frame has shown the sheet.
         """
         times = self._still_times
+        if not times:
+            raise PerceptionError("no frame has shown the sheet yet; call update with one.")
         return times[0] if self._declaration.mesh is not None else sum(times) // len(times)
 
     def sheet(self) -> Sheet:

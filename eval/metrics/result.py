@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool
 
+from jiggle_mj.argument_checks import as_path
 from jiggle_mj.episode import Episode
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
@@ -165,6 +166,7 @@ def score(directory: Path, truth_path: Path) -> Json:
     Raises:
         JiggleError: what `read_scorable` raises.
     """
+    directory, truth_path = as_path(directory, "the folder"), as_path(truth_path, "the truth file")
     return score_read(directory, *read_scorable(directory, truth_path))
 
 

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
+from jiggle_mj.argument_checks import as_path
 from jiggle_mj.episode import OnFrame, check_directory, clear_directory
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Sheet
@@ -72,6 +73,7 @@ def close_loop(
         JiggleError: what any of the parts raises.
         ValueError: an effect of the library gives no finite derivative, or changes a shape.
     """
+    recording_path, directory = as_path(recording_path, "the recording"), as_path(directory, "the folder")
     recording = Recording.open(recording_path, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     own = (DISCREPANCY, PAGE)
     check_directory(directory, own, overwrite=overwrite)

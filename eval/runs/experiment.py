@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jiggle_mj.actions import Grasp
+from jiggle_mj.argument_checks import as_instance, as_path
 from jiggle_mj.episode import (
     ESTIMATE,
     RECORDING,
@@ -92,8 +93,10 @@ def run_scene(
     Raises:
         JiggleError: what any of the parts raises.
     """
-    from jiggle_mj.scenes import Reference  # here, so that a recording can be estimated without MuJoCo
+    from jiggle_mj.scenes import Reference, Scene  # here, so that a recording can be estimated without MuJoCo
 
+    as_instance(scene, "scene", Scene, hint="load_scene(NAME) reads one.")
+    directory = as_path(directory, "the folder")
     policy = policy or scene.programme.policy
     planner, config = planner or policy_named(policy, scene, seed=seed), config or EstimatorConfig()
     if planner is not None:
@@ -178,6 +181,7 @@ def run_estimator(
     Raises:
         JiggleError: what any of the parts raises.
     """
+    recording_path, directory = as_path(recording_path, "the recording"), as_path(directory, "the folder")
     recording = Recording.open(recording_path, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     own = (ESTIMATE, RESULT, REPORT)
     check_directory(directory, own, overwrite=overwrite)

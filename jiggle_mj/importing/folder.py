@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from ..argument_checks import as_path
 from ..errors import OutputError, RecordingError
 from ..mesh_checks import check_mesh
 from ..observation import DeclaredMesh, MeasuredPoints, Observation
@@ -85,7 +86,7 @@ def import_folder(
         MeshError: the declared triangles are not one sheet.
         OutputError: an output exists, or cannot be written.
     """
-    folder, out = Path(folder), Path(out)
+    folder, out = as_path(folder, "the folder"), as_path(out, "the recording's path")
     data = DataFolder(path=folder, allow_outside=allow_outside)
     given = read_recording_toml(folder / "recording.toml" if recording_toml is None else Path(recording_toml))
     found = read_frames(data, given.points)

@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -20,6 +19,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from ..argument_checks import as_path
 from ..camera import StereoCamera
 from ..errors import RecordingError
 from ..observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolReport, ToolState
@@ -106,7 +106,9 @@ class Recording:
         Raises:
             RecordingError: missing, not an MCAP, truncated, damaged, foreign, holding truth, uncalibrated.
         """
-        contents = RecordingContents(Path(path), allow_truncated=allow_truncated)
+        contents = RecordingContents(
+            as_path(path, "the recording", error=RecordingError), allow_truncated=allow_truncated
+        )
         return cls(contents, tolerance_ns=tolerance_ns, pose_age_ns=pose_age_ns)
 
     @property

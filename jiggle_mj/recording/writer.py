@@ -11,7 +11,9 @@ from typing import Self
 import numpy as np
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 
+from ..argument_checks import as_instance, as_path, quoted
 from ..camera import StereoCamera
+from ..errors import OptionError
 from ..observation import Declaration, MeasuredPoints, Observation
 from .declaration import METADATA, file_metadata, write_declaration
 from .events import EVENT_SCHEMA, event_json
@@ -40,6 +42,7 @@ class RecordingWriter:
         overwrite: replace an existing file.
 
     Raises:
+        OptionError: an argument is of another type.
         OutputError: the path exists, or cannot be written.
     """
 
@@ -52,6 +55,12 @@ class RecordingWriter:
         metadata: dict[str, str],
         overwrite: bool = False,
     ) -> None:
+        path = as_path(path, "the recording's path")
+        if camera is not None:
+            as_instance(camera, "camera", StereoCamera)
+        as_instance(declaration, "declaration", Declaration)
+        if not all(isinstance(text, str) for text in (*as_instance(metadata, "metadata", dict), *metadata.values())):
+            raise OptionError(f"metadata must be a dict of texts; got {quoted(metadata)}.")
         self._camera = camera
         self._output = McapOutput(path, overwrite=overwrite)
         self._output.metadata(METADATA, file_metadata() | metadata)
@@ -72,8 +81,10 @@ class RecordingWriter:
         """Write one observation, and hand it to the operating system.
 
         Raises:
+            OptionError: this is no observation.
             ValueError: the observation has images, and the writer has no camera.
         """
+        as_instance(observation, "observation", Observation)
         output, time = self._output, observation.time
         for report in observation.reports:
             at_report = replace(observation.tool, position=report.position)

@@ -5,10 +5,11 @@ A disturbance has the name of the estimator's effect for it: the effect `gravity
 
 from collections.abc import Iterable
 from dataclasses import fields, replace
-from difflib import get_close_matches
 
+from jiggle_mj.argument_checks import as_instance
 from jiggle_mj.errors import SceneError
-from jiggle_mj.toml_kinds import MAX_SHOWN, shown
+from jiggle_mj.likely_name import did_you_mean
+from jiggle_mj.toml_kinds import shown
 
 from ..scene.disturbance import Disturbance
 from ..scene.scene import Scene
@@ -79,9 +80,8 @@ def disturbance_class(name: object) -> type[Disturbance]:
     if name is None:
         raise SceneError('a disturbance lacks its name; write for example name = "gravity".')
     if not isinstance(name, str) or name not in DISTURBANCES:
-        near = get_close_matches(str(name)[:MAX_SHOWN], DISTURBANCES, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ";"
-        raise SceneError(f"no disturbance named {shown(name)}{hint} There are {', '.join(DISTURBANCES)}.")
+        hint = did_you_mean(name, DISTURBANCES)
+        raise SceneError(f"no disturbance named {shown(name)}{hint}; there are {', '.join(DISTURBANCES)}.")
     return DISTURBANCES[name]
 
 
@@ -102,10 +102,14 @@ def disturbed(scene: Scene, texts: Iterable[str]) -> Scene:
     Raises:
         SceneError: a name is unknown, or a magnitude is not a number or out of its range.
     """
+    as_instance(scene, "scene", Scene, hint="load_scene(NAME) reads one.", error=SceneError)
+    if isinstance(texts, str) or not isinstance(texts, Iterable):
+        raise SceneError(f"disturbances must be a list of NAME or NAME=MAGNITUDE; got {texts!r}.")
     return replace(scene, disturbances=(*scene.disturbances, *map(_read, texts)))
 
 
 def _read(text: str) -> Disturbance:
+    as_instance(text, "a disturbance", str, error=SceneError)
     name, equals, magnitude = text.partition("=")
     base, dot, _ = name.partition(".")
     if dot and base in DISTURBANCES:

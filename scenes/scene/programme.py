@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jiggle_mj.actions import Action, Grasp, Move, Release, Wait
+from jiggle_mj.argument_checks import as_instance
 
 from .scene import Scene
 
@@ -32,7 +33,7 @@ def grasp_points(scene: Scene) -> tuple[tuple[float, float], ...]:
 
 def programme(scene: Scene) -> Iterator[Action]:
     """Yield the scene's actions in order; each gives one observation."""
-    plan = scene.programme
+    plan = as_instance(scene, "scene", Scene, hint="load_scene(NAME) reads one.").programme
     yield from still(scene)
     for point in grasp_points(scene):
         yield from _lift(scene, point)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields
 from typing import ClassVar
 
 from jiggle_mj import limits
+from jiggle_mj.argument_checks import as_flag, as_instance, as_integer, as_tuple_of
 from jiggle_mj.errors import SceneError
 from jiggle_mj.observation import Declaration
 from jiggle_mj.options import POLICIES
@@ -248,7 +249,15 @@ class Scene:
     declared: DeclaredConfig = field(default_factory=DeclaredConfig)
 
     def __post_init__(self) -> None:
-        """Check the relations between sections."""
+        """Check the types, then the relations between sections."""
+        as_instance(self.name, "Scene.name", str, error=SceneError)
+        as_integer(self.seed, "Scene.seed", at_least=0, error=SceneError)
+        as_flag(self.secret, "Scene.secret", error=SceneError)
+        as_tuple_of(self.attachments, "Scene.attachments", Attachment, error=SceneError)
+        as_tuple_of(self.disturbances, "Scene.disturbances", Disturbance, error=SceneError)
+        for entry in fields(self):
+            if isinstance(entry.type, type) and issubclass(entry.type, Section):
+                as_instance(getattr(self, entry.name), f"Scene.{entry.name}", entry.type, error=SceneError)
         if self.tissue.spacing > min(self.tissue.size) / 4:
             raise SceneError(
                 f"tissue.spacing = {self.tissue.spacing}: must be at most a quarter of the shorter side, "

@@ -311,7 +311,7 @@ def test_a_covariance_that_is_not_positive_definite_is_refused_by_the_particles_
 
 
 def test_an_update_of_no_sample_is_refused():
-    with pytest.raises(ValueError, match=r"EstimatorConfig\.samples must be an integer of at least 1; got 0"):
+    with pytest.raises(ValueError, match=r"EstimatorConfig\.samples = 0: must be an integer of at least 1"):
         EstimatorConfig(samples=0)
 
 
@@ -351,7 +351,7 @@ def test_a_belief_that_is_no_number_when_the_jaws_open_is_refused_and_the_last_o
 
 
 def test_a_negative_seed_is_refused():
-    with pytest.raises(ValueError, match=r"EstimatorConfig\.seed must be an integer of at least 0; got -1"):
+    with pytest.raises(ValueError, match=r"EstimatorConfig\.seed = -1: must be an integer of at least 0"):
         EstimatorConfig(seed=-1)
 
 

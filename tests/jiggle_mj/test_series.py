@@ -93,7 +93,10 @@ def test_overwrite_replaces_another_scene(scene, one_by_one, tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"count": 0}, "count = 0: must be at least 1"), ({"seed": -1}, "seed = -1: must be an integer of at least 0")],
+    [
+        ({"count": 0}, "count = 0: must be an integer of at least 1"),
+        ({"seed": -1}, "seed = -1: must be an integer of at least 0"),
+    ],
 )
 def test_numbers_out_of_range_are_refused_before_anything_is_written(options, message, scene, tmp_path):
     with pytest.raises(OptionError, match=message):

@@ -28,8 +28,8 @@ from tests.support.tiny_scene import call
     [
         (("--jobs", 2), 2, "--jobs is for several recordings: give --count as well"),
         (("--executor", "dask://localhost:1"), 2, "--executor is for several recordings: give --count as well"),
-        (("--count", 0), 2, "count = 0: must be at least 1"),
-        (("--count", 1, "--jobs", 0), 2, "jobs = 0: must be at least 1"),
+        (("--count", 0), 2, "count = 0: must be an integer of at least 1"),
+        (("--count", 1, "--jobs", 0), 2, "jobs = 0: must be an integer of at least 1"),
         (("--count", 1, "--jobs", 1, "--executor", "dask://localhost:1"), 2, "give one of them"),
         (("--count", 1, "--executor", "localhost:8786"), 2, "'localhost:8786': must be dask://HOST:PORT"),
         (("--count", 1, "--executor", "dask://localhost"), 2, "must be dask://HOST:PORT"),

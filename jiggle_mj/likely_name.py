@@ -1,0 +1,14 @@
+"""The name that was probably meant, for messages about an unknown one."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+MAX_COMPARED = 200
+"""Characters of a name that are compared: the comparison takes time with their square."""
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """Return ", did you mean NAME?" with the known name that is nearest, or nothing where none is near."""
+    by_lower = {each.lower(): each for each in known}
+    near = get_close_matches(str(name)[:MAX_COMPARED].lower(), by_lower, n=1)
+    return f", did you mean {by_lower[near[0]]!r}?" if near else ""
