@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from jaxtyping import Float, UInt8
 
 from ...errors import RecordingError
-from ...recording.schemas import decode_image
+from ...recording.images import decode_image
 
 COLOURS = {
     "rgb8": (3, None),
