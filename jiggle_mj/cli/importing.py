@@ -11,6 +11,9 @@ from ..errors import OptionError
 from .options import AsJson, Out, PathArgument, Repeated
 from .terminal import console
 
+SHOWN_REASONS = 8
+"""Reasons for leaving out frames that are printed."""
+
 if TYPE_CHECKING:
     from ..importing.bags.settings import BagSettings
 
@@ -126,10 +129,15 @@ def _import_bag(path: Path, out: Path, settings: "BagSettings", *, overwrite: bo
     console.print(table)
     for note in summary.notes:
         console.print(note, markup=False, highlight=False, soft_wrap=True)
-    for why, count in summary.skipped.items():
+    for why, count in list(summary.skipped.items())[:SHOWN_REASONS]:
         console.print(f"left out {count} frames: {why}", markup=False, highlight=False, soft_wrap=True)
+    if len(summary.skipped) > SHOWN_REASONS:
+        console.print(f"left out {sum(summary.skipped.values())} frames in all, for {len(summary.skipped)} reasons")
     console.print(
-        f"wrote {summary.recording}: {summary.n_frames} frames over {summary.duration:.3g} s, {summary.n_grasps} grasps"
+        f"wrote {summary.recording}: {summary.n_frames} frames over {summary.duration:.3g} s, "
+        f"{summary.n_grasps} grasps",
+        highlight=False,
+        soft_wrap=True,
     )
     if as_json:
         print(json.dumps({f.name: getattr(summary, f.name) for f in fields(summary)}, default=str))

@@ -7,7 +7,7 @@ of it is read, so a definition that nobody needs cannot stop an import.
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,6 +26,8 @@ ROS_ENCODINGS = ("cdr", "ros1")
 """Encodings of the messages of ROS 2 and ROS 1."""
 SQLITE_HEADER = 100
 """Bytes of the header of an SQLite file."""
+SHOWN_NAMES, SHOWN_NAME = 16, 80
+"""How many names a message lists, and how many characters of each."""
 SHOWN_REASON = 200
 """Characters of a library's own reason that a message shows."""
 
@@ -60,6 +62,13 @@ class BagMessage:
     """Time at which the recorder received it [ns]."""
     content: Any
     """The message, with the fields of its definition."""
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names for a message: the first `SHOWN_NAMES`, shortened to `SHOWN_NAME` characters each."""
+    every = list(names)
+    more = f" and {len(every) - SHOWN_NAMES} more" if len(every) > SHOWN_NAMES else ""
+    return (", ".join(name[:SHOWN_NAME] for name in every[:SHOWN_NAMES]) + more) or "none"
 
 
 def is_bag(path: Path) -> bool:
@@ -267,8 +276,12 @@ def _mcap_topic(channel: Channel, schema: Schema | None) -> BagTopic:
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    """Return the storage files of a folder, numbers in their names in the order of counting."""
-    files = [file for suffix in STORAGE_SUFFIXES for file in folder.glob(f"*{suffix}")]
+    """Return the storage files of a folder, in the order of counting."""
+    return _in_order(file for suffix in STORAGE_SUFFIXES for file in folder.glob(f"*{suffix}"))
+
+
+def _in_order(files: Iterable[Path]) -> list[Path]:
+    """Return files by name, with the numbers in their names in the order of counting."""
     return sorted(files, key=lambda file: [(part.isdigit(), part.zfill(20)) for part in re.split(r"(\d+)", file.name)])
 
 
@@ -285,14 +298,15 @@ def _bag_files(path: Path) -> list[Path]:
     if path.is_dir():
         if (path / "metadata.yaml").exists():
             return [path]
-        files = _storage_files(path) or sorted(path.glob("*.bag"))
+        files = _storage_files(path) or _in_order(path.glob("*.bag"))
         if not files:
             raise RecordingError(f"{path} holds no bag: no metadata.yaml, and no .mcap, .db3 or .bag file.")
         return files
     if path.suffix not in (*STORAGE_SUFFIXES, ".bag"):
         raise RecordingError(
             f"{path} is not read as a bag: give a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag "
-            "(a .bag.active file was not closed: 'rosbag reindex' mends it)."
+            "(a file compressed by ROS 2 needs its folder; 'rosbag reindex' mends a .bag.active file, which was not "
+            "closed)."
         )
     return [path]
 
@@ -327,5 +341,6 @@ def _refusing(path: Path, part: str = "the bag") -> Iterator[None]:
     except RecordingError:
         raise
     except Exception as failure:
+        cure = " 'rosbag reindex' mends a file that was not closed." if path.suffix == ".bag" else ""
         reason = " ".join((str(failure) or type(failure).__name__).split())[:SHOWN_REASON]
-        raise RecordingError(f"{path}: {part} cannot be read ({reason}); is it damaged or cut off?") from failure
+        raise RecordingError(f"{path}: {part} cannot be read ({reason}); is it damaged or cut off?{cure}") from failure

@@ -21,6 +21,8 @@ MODELS = ("plumb_bob", "rational_polynomial")
 """Distortion models that are read; with coefficients of zero every model is none."""
 MAX_BASELINE = 2.0
 """Longest baseline that is read [m]; a longer one is in millimetres."""
+MAX_ROTATION_ERROR = 1e-3
+"""Largest entry of R R^T - 1 of a rotation: a calibration file's rounding to four digits."""
 BASELINE_AGREEMENT = 0.05
 """Largest relative difference of the baselines of CameraInfo and /tf that passes without a word."""
 
@@ -169,6 +171,8 @@ def _source(
         raise RecordingError(f"{where}: K, R, P have {K.size}, {R.size}, {P.size} numbers; they must have 9, 9, 12.")
     if not all(np.isfinite(each).all() for each in (K, D, R, P)):
         raise RecordingError(f"{where} holds numbers that are not finite.")
+    if not np.allclose(R.reshape(3, 3) @ R.reshape(3, 3).T, np.eye(3), atol=MAX_ROTATION_ERROR):
+        raise RecordingError(f"{where}: R is no rotation: {R.round(6).tolist()}.")
     if not (K[0] > 0 and K[4] > 0 and width > 0 and height > 0):
         raise RecordingError(
             f"{where} is not calibrated: fx = {K[0]:g}, size {width}x{height}; calibrate the camera, and give the file "

@@ -19,7 +19,7 @@ FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8:
 """Numbers of sensor_msgs/PointField to numpy's types."""
 ID_FIELDS = ("track_id", "id", "point_id", "ids", "index", "label")
 """Usual names of the field that numbers material points, the first that is there."""
-MAX_POINTS = 100_000
+MAX_POINTS = 20_000
 """Points of a cloud that are read: above any tracked sheet; a camera's whole cloud must be cut to the tissue."""
 
 
@@ -30,7 +30,7 @@ def cloud_points(message: Any, id_field: str | None) -> tuple[Float[np.ndarray, 
 
     Args:
         message: a `sensor_msgs/PointCloud2`.
-        id_field: field of the numbers; None to look for `ID_FIELDS`.
+        id_field: field of the numbers; empty for none; None to look for `ID_FIELDS`.
 
     Raises:
         RecordingError: no x, y, z, no such field, too many points, numbers that repeat, or data that are too short.
@@ -42,8 +42,8 @@ def cloud_points(message: Any, id_field: str | None) -> tuple[Float[np.ndarray, 
     positions = np.column_stack([columns[name].astype(float) for name in "xyz"])
     unseen = ~np.isfinite(positions).all(axis=1)
     positions[unseen] = np.nan
-    name = id_field or next((name for name in ID_FIELDS if name in columns), None)
-    if name is None:
+    name = next((name for name in ID_FIELDS if name in columns), "") if id_field is None else id_field
+    if not name:
         return _bounded(positions[~unseen]), None
     numbers = columns[name].astype(float)
     if not (
@@ -51,7 +51,9 @@ def cloud_points(message: Any, id_field: str | None) -> tuple[Float[np.ndarray, 
     ):
         raise RecordingError(f"has numbers in '{name}' that are not whole numbers of 32 bits")
     if len(np.unique(numbers)) != len(numbers):
-        raise RecordingError(f"has the same number in '{name}' more than once; name another field with [points] id")
+        raise RecordingError(
+            f"has the same number in '{name}' more than once; name another field, or \"\" for none, with [points] id"
+        )
     return _bounded(positions), numbers.astype(np.int64)
 
 

@@ -140,6 +140,11 @@ def jaw_states(
     Raises:
         RecordingError: numbers without a rule.
     """
+    if rule is None and "open" in topic.lower() and values and isinstance(values[0], bool):
+        raise RecordingError(
+            f"the name of {topic} says open, not closed; give --closed 'data==false' if true means open, else "
+            "--closed 'data==true'."
+        )
     if values and isinstance(values[0], dict):
         return [JawState(time=time, **value) for time, value in zip(stamps, values, strict=True)], 0
     numbers = [float(value) for value in values]

@@ -30,6 +30,7 @@ from .missing import refuse_foreign
 from .preparation import FrameParts, Preparation, prepare
 from .roles import choose_roles
 from .settings import BagSettings, Role
+from .tool_in_view import tool_in_view
 from .transforms import frame_name
 
 JAW_DELAY = 5_000_000
@@ -80,6 +81,8 @@ def import_bag(
     bag, out, settings = Path(bag), Path(out), settings or BagSettings()
     if out.exists() and not overwrite:
         raise OutputError(f"{out} exists; choose another path, or allow the file to be replaced (--overwrite).")
+    if out.resolve() == bag.resolve() or bag.resolve() in out.resolve().parents:
+        raise OutputError(f"{out} is the bag, or lies in it; choose another path.")
     with Bag(bag) as source:
         try:
             return _import(source, out, settings)
@@ -93,7 +96,9 @@ def _import(bag: Bag, out: Path, settings: BagSettings) -> BagSummary:
     prepared = prepare(bag, roles, unsure, settings)
     notes = list(prepared.notes)
     camera = _checked_camera(bag, prepared, notes)
-    partial = out.with_name(f".{out.name}.partial")
+    if camera is not None:
+        notes += tool_in_view(camera, prepared)
+    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     skipped: Counter[str] = Counter()
     written: list[int] = []
     try:
@@ -121,8 +126,8 @@ def _import(bag: Bag, out: Path, settings: BagSettings) -> BagSummary:
         notes.append("the jaws never close, so there is nothing to estimate from")
     return BagSummary(
         recording=out,
-        topics={role: choice.topic for role, choice in roles.items()},
-        guessed=tuple(role for role, choice in roles.items() if not choice.by_user),
+        topics={role: choice.topic for role, choice in prepared.roles.items()},
+        guessed=tuple(role for role, choice in prepared.roles.items() if not choice.by_user),
         n_frames=len(written),
         duration=(written[-1] - written[0]) / 1e9,
         n_grasps=max((state.grasp for state in used), default=0),

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from ...errors import RecordingError
 from ...recording.topics import GRASP, POSE
-from .bag_file import ROS_ENCODINGS, Bag
+from .bag_file import ROS_ENCODINGS, Bag, listed
 from .gripper import ALWAYS
 from .roles import TYPES, RoleChoice
 from .settings import BagSettings, Role
@@ -34,7 +34,7 @@ def refuse_foreign(bag: Bag) -> None:
         raise RecordingError(f"{bag.path} is a recording already; use it: jiggle-mj estimate {bag.path} --out DIR.")
     encodings = sorted({f"{topic.type} ({topic.encoding})" for topic in topics})
     raise RecordingError(
-        f"{bag.path} holds no message of ROS 1 or ROS 2, but {', '.join(encodings[:8]) or 'nothing'}; a file of "
+        f"{bag.path} holds no message of ROS 1 or ROS 2, but {listed(encodings)}; a file of "
         "Foxglove's messages is a recording if its topics have the names in docs/RECORDINGS.md."
     )
 
@@ -72,7 +72,7 @@ def missing_roles(
         if role in roles:
             continue
         if role in unsure:
-            found.append(f"{NEEDS[role]}: one of {', '.join(unsure[role][:8])} (--topic {role}=TOPIC)")
+            found.append(f"{NEEDS[role]}: one of {listed(unsure[role])} (--topic {role}=TOPIC)")
         else:
             found.append(f"{NEEDS[role]} ({_cure(role)})")
     return found

@@ -9,7 +9,7 @@ from ...camera import CameraCalibration, StereoCamera
 from ...errors import RecordingError
 from ...observation import Declaration
 from ...recording.force import ToolForce
-from .bag_file import Bag
+from .bag_file import Bag, listed
 from .calibration import CameraSource, parse_camera_info, read_camera_file, stereo_camera
 from .gripper import ALWAYS, JawState, jaw_states, jaw_value
 from .missing import missing_roles
@@ -128,9 +128,7 @@ def _world(survey: BagSurvey, main: Role, settings: BagSettings, notes: list[str
     sensor, tree = survey.frame[main], survey.tree
     world = settings.world or (tree.root(sensor) if sensor else "world")
     if settings.world is not None and settings.world not in tree.names and settings.world != sensor:
-        raise RecordingError(
-            f"/tf has no frame '{settings.world[:200]}'; it has: {', '.join(sorted(tree.names)[:20]) or 'none'}."
-        )
+        raise RecordingError(f"/tf has no frame '{settings.world[:200]}'; it has: {listed(sorted(tree.names))}.")
     if world == sensor and settings.declaration is None and "optical" in world:
         notes.append(f"the world is the camera's frame '{world}', whose vertical is unknown: gravity is left out")
         return world, replace(Declaration(), gravity=(0.0, 0.0, 0.0), bed=False)

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ...errors import RecordingError
-from .bag_file import BagTopic
+from .bag_file import BagTopic, listed
 from .settings import ROLES, Role
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -111,9 +111,7 @@ def is_rectified(topic: str) -> bool:
 
 def _refuse_unfit(role: Role, name: str, topics: dict[str, BagTopic]) -> None:
     if name not in topics:
-        raise RecordingError(
-            f"the bag has no topic '{name[:200]}' for {role}; it has: {', '.join(list(topics)[:30]) or 'none'}."
-        )
+        raise RecordingError(f"the bag has no topic '{name[:200]}' for {role}; it has: {listed(topics)}.")
     if topics[name].type not in TYPES[role]:
         raise RecordingError(f"{name} is {topics[name].type}; a topic for {role} must be {' or '.join(TYPES[role])}.")
     if not topics[name].count:

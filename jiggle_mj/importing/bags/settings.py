@@ -65,7 +65,7 @@ class BagSettings:
     world: str | None = None
     """Frame that counts as the world; None for the root of /tf."""
     id_field: str | None = None
-    """Field of the clouds that numbers the material points; None to look for a usual name."""
+    """Field of the clouds that numbers the material points; empty for none, None to look for a usual name."""
     noise_sd: float | None = None
     """Standard deviation of each coordinate of the clouds [m]; None for the default of `MeasuredPoints`."""
     depth: DepthSettings = DepthSettings()

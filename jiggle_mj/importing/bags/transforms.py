@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ...errors import RecordingError
 from ...recording.schemas import refuse_bad_pose
+from .bag_file import listed
 
 MAX_TREMBLE_M = 2e-4
 """Largest distance of a still frame from its mean position [m]: the noise of a measured point."""
@@ -185,7 +186,7 @@ class TransformTree:
             if name not in self._parents or name in chain:
                 raise RecordingError(
                     f"{where} is in the frame '{chain[0] if chain else name}', and /tf does not lead from there to "
-                    f"'{world}' (it ends at '{name}'; frames: {', '.join(sorted(self.names)[:12]) or 'none'}). Record "
+                    f"'{world}' (it ends at '{name}'; frames: {listed(sorted(self.names))}). Record "
                     "/tf and /tf_static, or name another common frame with --world."
                 )
             chain.append(name)

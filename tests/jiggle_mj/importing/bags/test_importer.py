@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jiggle_mj import Recording
-from jiggle_mj.errors import RecordingError
+from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.importing.bags.gripper import ClosedRule
 from jiggle_mj.importing.bags.importer import BagSummary, import_bag
 from jiggle_mj.importing.bags.settings import BagSettings, DepthSettings
@@ -271,7 +271,10 @@ def test_without_tf_the_camera_is_the_world_and_gravity_unknown(tmp_path: Path):
         made.info("/right/camera_info", 0, small_camera().right)
 
     def tool(made: RobotBag) -> None:
-        write_tool(made, frame="left_optical")
+        for index in range(4):
+            pose = made.header(index * STEP, "left_optical")
+            made.pose("/tool/pose", index * STEP, [0, 0, 0.1], header=pose)
+            made.write("/gripper/closed", index * STEP, "std_msgs/Bool", data=True)
 
     path = bag(tmp_path, infos, tool, write_images)
     summary, recording = imported(path)
@@ -287,3 +290,41 @@ def test_images_of_another_size_than_the_calibration_are_refused(tmp_path: Path)
             made.image(f"/{side}/image_raw", 0, "rgb8", np.zeros((48, 64, 3), np.uint8))
 
     assert "/left/image_raw is 64x48 and its calibration 32x24" in refused(bag(tmp_path, cameras, write_tool, large))
+
+
+def tool_at(*position: float) -> Callable[[RobotBag], None]:
+    def write(made: RobotBag) -> None:
+        for index in range(4):
+            made.pose("/tool/pose", index * STEP, position)
+            made.write("/gripper/closed", index * STEP, "std_msgs/Bool", data=True)
+
+    return write
+
+
+def test_a_tip_that_no_camera_can_see_is_named(tmp_path: Path):
+    """The camera is 0.1 m above the origin and looks down: a tip at 0.5 m is behind it, one at 30 m beside it."""
+    (tmp_path / "beside").mkdir()
+    summary, _ = imported(bag(tmp_path / "beside", cameras, write_images, tool_at(30.0, 0.0, 0.0)))
+    assert any(note.startswith("WARNING: with closed jaws the tip is always far outside") for note in summary.notes)
+    assert "always behind the left camera" in refused(bag(tmp_path, cameras, write_images, tool_at(0.0, 0.0, 0.5)))
+
+
+def test_the_name_of_a_bool_is_taken_at_its_word(tmp_path: Path):
+    def opened(made: RobotBag) -> None:
+        for index in range(4):
+            made.pose("/tool/pose", index * STEP, [0, 0, 0])
+            made.write("/gripper/is_open", index * STEP, "std_msgs/Bool", data=index % 2 == 0)
+
+    path = bag(tmp_path, cameras, write_images, opened)
+    assert "give --closed 'data==false' if true means open" in refused(path)
+    _, recording = imported(path, closed=ClosedRule.parse("data==false"))
+    assert [each.tool.closed for each in recording] == [False, True, False, True]
+
+
+def test_the_bag_itself_is_never_replaced(tmp_path: Path):
+    path = small_bag(tmp_path / "bag") / "bag.mcap"
+    before = path.read_bytes()
+    for out in (path, path.parent / "run.mcap"):
+        with pytest.raises(OutputError, match="is the bag, or lies in it"):
+            import_bag(path.parent, out, overwrite=True) if out != path else import_bag(path, out, overwrite=True)
+    assert path.read_bytes() == before

@@ -89,3 +89,10 @@ def test_options_go_before_the_map():
 def test_options_out_of_range_are_refused(changes: dict):
     with pytest.raises(OptionError, match="must be"):
         with_options(BagSettings(), **changes)
+
+
+def test_the_map_in_the_docs_is_read(tmp_path: Path):
+    page = (Path(__file__).parents[4] / "docs" / "BAGS.md").read_text(encoding="utf-8")
+    (tmp_path / "map.toml").write_text(page.partition("```toml\n")[2].partition("```")[0])
+    found = read_map(tmp_path / "map.toml")
+    assert found.topics["tool"] == "tf:psm_tool_tip" and found.declaration is not None
