@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -227,36 +227,42 @@ class _Decoder:
     """Decoder of the messages of one topic, by the definition in the bag, or else by ROS's own."""
 
     def __init__(self, path: Path, topic: BagTopic) -> None:
-        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-
         self._path, self._topic = path, topic
         if topic.encoding not in ROS_ENCODINGS:
             raise RecordingError(
                 f"{path}: {topic.name} is {topic.type} encoded as '{topic.encoding}'; messages of ROS 1 and ROS 2 are "
                 "read."
             )
-        if not topic.definition.strip():
-            self._store = get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
-            if topic.type not in self._store.fielddefs:
-                raise RecordingError(
-                    f"{path}: {topic.name} has the type {topic.type}, which the bag does not define; leave the topic "
-                    "out, or record it again as MCAP, which keeps definitions."
-                )
-            return
         with _refusing(path, f"the definition of {topic.type}"):
-            self._store = get_typestore(Stores.EMPTY)
-            if topic.definition_format == "idl":
-                for part in re.split(r"=+\nIDL: .*\n", topic.definition):
-                    if part.strip():
-                        self._store.register(get_types_from_idl(part))
-            else:
-                self._store.register(get_types_from_msg(topic.definition, topic.type))
+            self._store = _typestore(topic.type, topic.definition.strip(), topic.definition_format, topic.encoding)
+        if topic.type not in self._store.fielddefs:
+            raise RecordingError(
+                f"{path}: {topic.name} has the type {topic.type}, which the bag does not define; leave the topic out, "
+                "or record it again as MCAP, which keeps definitions."
+            )
 
     def decode(self, data: bytes) -> Any:
         with _refusing(self._path, f"a message on {self._topic.name} ({self._topic.type})"):
             if self._topic.encoding == "ros1":
                 return self._store.deserialize_ros1(data, self._topic.type)
             return self._store.deserialize_cdr(data, self._topic.type)
+
+
+@lru_cache(maxsize=64)
+def _typestore(kind: str, definition: str, language: str, encoding: str) -> Any:
+    """Return rosbags' store of one type and those inside it; a type that a bag does not define is ROS's own."""
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    if not definition:
+        return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.EMPTY)
+    if language == "msg":
+        store.register(get_types_from_msg(definition, kind))
+        return store
+    for part in re.split(r"=+\nIDL: .*\n", definition):
+        if part.strip():
+            store.register(get_types_from_idl(part))
+    return store
 
 
 def _mcap_topic(channel: Channel, schema: Schema | None) -> BagTopic:

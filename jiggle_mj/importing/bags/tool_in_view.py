@@ -32,7 +32,8 @@ def tool_in_view(camera: StereoCamera, prepared: Preparation) -> list[str]:
     if not (seen[:, 2] > 0).any():
         raise RecordingError(
             f"with closed jaws the tip is always behind the left camera ({shown}). Is the frame of "
-            f"{prepared.topic('left')} an optical one (x right, y down, z forward), and is {prepared.topic('tool')} in metres?"
+            f"{prepared.topic('left')} an optical one (x right, y down, z forward), and {prepared.topic('tool')} in "
+            "metres?"
         )
     pixels = camera.project(np.array(tips)[seen[:, 2] > 0])[:, :2]
     size = np.array([camera.left.width, camera.left.height])

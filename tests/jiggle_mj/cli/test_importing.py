@@ -49,7 +49,7 @@ def test_inspect_reads_recordings_of_ours(tmp_path, monkeypatch, capsys):
     assert {each["name"]: each["count"] for each in report["topics"]}["/camera/left/image_raw"] == 4
 
 
-@pytest.mark.parametrize("verb", ("run", "estimate", "close-loop"))
+@pytest.mark.parametrize("verb", ("run", "estimate"))
 def test_a_verb_that_needs_a_recording_names_the_command(tmp_path, monkeypatch, capsys, verb):
     path = small_bag(tmp_path / "bag")
     assert call(monkeypatch, verb, path, "--out", tmp_path / "out") == 1
