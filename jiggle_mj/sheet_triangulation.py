@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import Delaunay, KDTree
+from scipy.spatial import Delaunay, KDTree, QhullError
+
+from .errors import MeshError
 
 MIN_OUTLINE_SHAPE = 0.25
 """Twice the area over the longest edge squared below which an outline triangle is dropped (equilateral: 0.87)."""
@@ -68,8 +70,16 @@ def triangulate(flat: Float[np.ndarray, "m 2"], longest_edge: float) -> Int[np.n
     Args:
         flat: points in the plane [m].
         longest_edge: length above which an edge's triangles are dropped [m].
+
+    Raises:
+        MeshError: fewer than three points, or all on one line.
     """
-    faces = Delaunay(flat).simplices.astype(np.int64)
+    try:
+        faces = Delaunay(flat).simplices.astype(np.int64)
+    except (QhullError, ValueError) as failure:
+        raise MeshError(
+            f"{len(flat)} points cannot be triangulated: they lie on one line, or at one place."
+        ) from failure
     corners = flat[faces]
     edges = corners - np.roll(corners, 1, axis=1)
     signed = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]

@@ -20,7 +20,7 @@ from .points.text_table import TextTable
 
 MAX_MATCH_SPACINGS = 0.5
 """Distance of a vertex from its point, in spacings of the vertices: beyond it another vertex may be nearer."""
-MAX_EDGE_ERROR = 0.3
+MAX_EDGE_ERROR = 0.1
 """Relative difference of lengths, up to one scale, by which the median edge of a mesh is still that of the points."""
 FAR_EDGE_SHARE, FAR_EDGE_POINTS = 0.25, 30
 """Share of the sheet's diagonal that the median edge of so many points or more cannot have: points at random have a
@@ -88,10 +88,12 @@ def _by_rows(path: Path, mesh: MeshFile, rest: Float[np.ndarray, "n 3"], notes: 
     farthest = MAX_MATCH_SPACINGS * spacing
     if len(vertices) == len(rest):
         apart = np.linalg.norm(vertices[seen] - rest[seen], axis=1)
-        if np.median(apart) <= farthest or _same_edges(vertices, rest, faces):
+        if np.median(apart) <= farthest:
             return faces
     distance, nearest = KDTree(vertices).query(rest[seen])
     matched = len(set(nearest.tolist())) == len(seen) and float(np.max(distance)) <= farthest
+    if not matched and len(vertices) == len(rest) and _same_edges(vertices, rest, faces):
+        return faces
     if not matched or len(vertices) > len(rest):
         raise RecordingError(
             f"{path} has {len(vertices)} vertices, which are not the {len(rest)} points: the farthest point is "

@@ -65,9 +65,10 @@ def _without_unseen(
     if measured.seen is not None:
         unseen |= ~measured.seen
     positions = np.where(unseen[:, :, np.newaxis], np.nan, positions)
-    accepted = points.missing is not None and points.missing.place is None and points.missing.column is None
-    if not accepted:
-        MarkCheck(names=measured.names, headings=measured.headings).refuse_marks(positions)
+    check = MarkCheck(names=measured.names, headings=measured.headings)
+    check.refuse_far(positions)
+    if points.missing is None or points.missing.place is not None or points.missing.column is not None:
+        check.refuse_marks(positions)
     return positions
 
 

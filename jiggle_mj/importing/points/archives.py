@@ -4,6 +4,7 @@ Nothing is unpickled: a pickle can run code.
 """
 
 import struct
+import tokenize
 import warnings
 import zipfile
 import zlib
@@ -37,6 +38,7 @@ DAMAGE = (
     AttributeError,
     AssertionError,
     struct.error,
+    tokenize.TokenError,
     zlib.error,
     LZMAError,
     zipfile.BadZipFile,
@@ -153,7 +155,7 @@ def _refuse_large(path: Path, name: str, stream: BufferedIOBase, n_bytes: int) -
         declared *= length
     if declared > MAX_POSITION_BYTES:
         raise RecordingError(
-            f"{path}: {name} has shape {quoted(shape)}, {declared} bytes; at most {MAX_POSITION_BYTES} are read: split "
+            f"{path}: {name} has shape {quoted(shape)}; at most {MAX_POSITION_BYTES} bytes are read: split "
             "the recording, or keep fewer points or frames."
         )
     if declared // 8 * dtype.itemsize > n_bytes:

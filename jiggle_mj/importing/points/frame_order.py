@@ -26,12 +26,12 @@ def frame_files(folder: DataFolder, patterns: Sequence[str]) -> tuple[list[Path]
     notes: list[str] = []
     for pattern in patterns:
         found = sorted(folder.matching(pattern))
-        natural = sorted(found, key=lambda path: (_natural(_stem(path)), path.name))
-        _refuse_unequal_fractions(natural, pattern)
-        if natural != found:
-            before, after = next((a, b) for a, b in pairwise(natural) if found.index(a) > found.index(b))
+        ordered = sorted(found, key=lambda path: (_natural(_stem(path)), path.name))
+        _refuse_unequal_fractions(ordered, pattern)
+        if ordered != found:
+            before, after = next((a, b) for a, b in pairwise(ordered) if found.index(a) > found.index(b))
             notes.append(f"frames are in the order of their numbers: {before.name} before {after.name}")
-        paths += natural
+        paths += ordered
     twice = next((path for path in paths if paths.count(path) > 1), None) if len(set(paths)) < len(paths) else None
     if twice is not None:
         raise RecordingError(f"[points] files names {twice.name} twice; each file is one frame.")

@@ -100,6 +100,7 @@ def _spread(array: Shaped[np.ndarray, "t n c"], *, average_over: int) -> float:
     values = np.asarray(array, dtype=np.float64)
     seen = np.isfinite(values).all(axis=2, keepdims=True)
     count = seen.sum(axis=average_over)
-    sums = np.where(seen, values, 0.0).sum(axis=average_over)
-    means: Float[np.ndarray, "m c"] = (sums / np.maximum(count, 1))[count[:, 0] > 0]
-    return float(np.sqrt(means.var(axis=0).sum())) if len(means) else 0.0
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd coordinates are refused later, by name
+        sums = np.where(seen, values, 0.0).sum(axis=average_over)
+        means: Float[np.ndarray, "m c"] = (sums / np.maximum(count, 1))[count[:, 0] > 0]
+        return float(np.sqrt(means.var(axis=0).sum())) if len(means) else 0.0

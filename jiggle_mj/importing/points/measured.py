@@ -87,6 +87,7 @@ def _moves(positions: Float[np.ndarray, "t n c"]) -> bool:
 
 def _moves_by(positions: Float[np.ndarray, "t n c"], given: Float[np.ndarray, "t n c"]) -> bool:
     """Return whether the motion from the first frame is nearer to the displacements than to none."""
-    motion, said = positions - positions[0], given - given[0]
-    both = np.isfinite(motion).all(axis=2) & np.isfinite(said).all(axis=2)
-    return bool(np.square((motion - said)[both]).sum() < 0.5 * np.square(motion[both]).sum())
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd coordinates are refused later, by name
+        motion, said = positions - positions[0], given - given[0]
+        both = np.isfinite(motion).all(axis=2) & np.isfinite(said).all(axis=2)
+        return bool(np.square((motion - said)[both]).sum() < 0.5 * np.square(motion[both]).sum())

@@ -23,7 +23,7 @@ OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
 }
 """Comparisons of a rule, the longer signs first."""
 RULE = re.compile(r"\s*(?P<column>.*?)\s*(?P<sign>==|!=|<=|>=|<|>)\s*(?P<value>[^=<>]+?)\s*")
-"""`COLUMN OPERATOR NUMBER`."""
+"""A rule is written `COLUMN OPERATOR NUMBER`."""
 
 FLOAT32_ROUNDING = 1e-6
 """Relative difference between a number and what a file of 32-bit floats holds of it."""

@@ -75,19 +75,28 @@ class MarkCheck:
     headings: tuple[str, ...] = field(default=())
     """Columns or arrays beside the positions, offered in the error."""
 
+    def refuse_far(self, positions: Float[np.ndarray, "t n 3"]) -> None:
+        """Refuse positions that are too far away for any sheet, in any unit.
+
+        Raises:
+            RecordingError: such a position is there; names frame, rows and place.
+        """
+        far = (np.abs(np.nan_to_num(positions)) > MAX_COORDINATE).any(axis=2)
+        frames, points = np.nonzero(far)
+        if len(frames):
+            rows = points[frames == frames[0]]
+            self._refuse(int(frames[0]), positions[frames[0], rows[0]], rows, "too far away for a point")
+
     def refuse_marks(self, positions: Float[np.ndarray, "t n 3"]) -> None:
         """Refuse positions that cannot be those of points.
 
         Two points cannot be at one place; a point that is at 0, 0, 0 or another usual mark in some frames alone has
-        not moved there; no sheet is a million metres away.
+        not moved there.
 
         Raises:
             RecordingError: such a position is there; names frame, rows and place.
         """
         for number, frame in enumerate(positions):
-            large = np.flatnonzero((np.abs(np.nan_to_num(frame)) > MAX_COORDINATE).any(axis=1))
-            if len(large):
-                self._refuse(number, frame[large[0]], large, "too far away for a point")
             rows = _shared_place(frame)
             if len(rows):
                 self._refuse(number, frame[rows[0]], rows, "two points cannot be at one place")
