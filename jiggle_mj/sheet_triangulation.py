@@ -16,6 +16,10 @@ MIN_OUTLINE_SHAPE = 0.25
 """Twice the area over the longest edge squared below which an outline triangle is dropped (equilateral: 0.87)."""
 CLEARANCE = 0.6
 """Distance to a measured point below which a lattice point is left out [spacings]."""
+MAX_ADDED = 20_000
+"""Vertices that a continuation may have: more than an estimate can use."""
+BORDER_CLEARANCE = 0.5
+"""Distance to the outline below which a lattice point inside is left out [spacings]."""
 END_SHARE, END_SPACINGS = 0.1, 1.5
 """Length of the end zone that gives the width of a strip: a share of the measured length, and at least so many
 spacings, so that one unseen corner does not narrow the sheet."""
@@ -128,3 +132,50 @@ def extend(flat: Float[np.ndarray, "m 2"], *, begin: float, end: float, spacing:
             pieces.append(np.column_stack([np.full(len(across), edge + outward * length * row / n_rows), across]))
     lattice = np.concatenate(pieces)
     return lattice[KDTree(flat).query(lattice)[0] >= CLEARANCE * spacing]
+
+
+def fill_outline(
+    flat: Float[np.ndarray, "m 2"], *, outline: Float[np.ndarray, "k 2"], spacing: float, clearance: float
+) -> Float[np.ndarray, "a 2"]:
+    """Return vertices on a polygon's border and a triangular lattice within it, clear of the measured points.
+
+    Args:
+        flat: measured points in the plane [m].
+        outline: corners of the polygon, in turn [m].
+        spacing: spacing of the vertices [m].
+        clearance: distance to a measured point below which a vertex is left out [m].
+
+    Raises:
+        MeshError: the polygon would need more than `MAX_ADDED` vertices.
+    """
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    pitch = np.array([spacing, spacing * np.sqrt(3) / 2])
+    n_across, n_rows = np.ceil((high - low) / pitch).astype(int) + 1
+    if not n_across * n_rows <= MAX_ADDED:
+        raise MeshError(
+            f"a sheet of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m at a spacing of {spacing:.3g} m has about "
+            f"{float(n_across) * float(n_rows):.3g} vertices; at most {MAX_ADDED} are allowed: give a larger spacing."
+        )
+    row, column = np.mgrid[:n_rows, :n_across]
+    lattice = low + np.column_stack([(column + 0.5 * (row % 2)).ravel(), row.ravel()]) * pitch
+    border = np.concatenate(
+        [
+            np.linspace(begin, end, max(1, round(float(np.linalg.norm(end - begin)) / spacing)), endpoint=False)
+            for begin, end in zip(outline, np.roll(outline, -1, axis=0), strict=True)
+        ]
+    )
+    inside = lattice[_within(lattice, outline)]
+    inside = inside[KDTree(border).query(inside)[0] >= BORDER_CLEARANCE * spacing]
+    added = np.concatenate([border, inside])
+    return added[KDTree(flat).query(added)[0] >= clearance]
+
+
+def _within(points: Float[np.ndarray, "p 2"], outline: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, " p"]:
+    """Return which points lie within a polygon, by the even-odd rule."""
+    inside = np.zeros(len(points), bool)
+    for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        if ay == by:
+            continue
+        crosses = (ay > points[:, 1]) != (by > points[:, 1])
+        inside ^= crosses & (points[:, 0] < ax + (points[:, 1] - ay) * (bx - ax) / (by - ay))
+    return inside

@@ -4,6 +4,7 @@ Checks keys and kinds of values only; `folder` compares them with the data files
 data files, whose unit the description gives.
 """
 
+import json
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -18,14 +19,16 @@ from ..errors import RecordingError
 from ..observation import Declaration
 from ..recording.schemas import NS_PER_S
 from ..toml_kinds import StrictTable
+from .clock import MAX_PERIOD, MIN_PERIOD
+from .data_folder import quoted
+from .grasp_table import GraspTable, Rows, read_choice, read_grasps
 from .points.points_table import PointFiles, read_points_table
+from .units import LENGTH_UNITS, TIME_UNITS, unit_of
 
-UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-"""Metres in one unit of the data files."""
 MAX_ROTATION_ERROR = 1e-6
 """Largest entry of R R^T - 1 of a rotation: the rounding of six decimals."""
-DEFAULT_GRASP_RADIUS = 2e-3
-"""Radius of the grip where none is given [m]; without effect where rows or vertices are declared held."""
+MAX_OUTLINE_POINTS = 1000
+"""Corners that an outline may have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,47 +39,6 @@ class WorldFrame:
     """Rotation matrix from the data to the world."""
     translation: Float[np.ndarray, " 3"]
     """Origin of the data in the world [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rows:
-    """A choice of points by their row numbers."""
-
-    rows: tuple[int, ...] = ()
-    """Row numbers, where no file is given."""
-    file: str | None = None
-    """Text file of row numbers, separated by blanks or commas."""
-    first: int = 0
-    """Number of the first row."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class GraspPath:
-    """A straight pull by an instrument whose position was not measured."""
-
-    start: Float[np.ndarray, " 3"]
-    """Position of the tip at the rest frame, in the world [m]."""
-    direction: Float[np.ndarray, " 3"]
-    """Unit vector of the pull in the world."""
-    step: float
-    """Displacement from frame to frame [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReportedTool:
-    """An instrument that reported its position, at times of its own."""
-
-    tool: str
-    """Name of the positions in the .npz, shape (reports, 3), in the unit and frame of the points."""
-    times: str
-    """Name of the reports' times in the .npz, shape (reports,), increasing [s]."""
-    orientations: str | None
-    """Name of the quaternions wxyz in the .npz, shape (reports, 4), in the frame of the points; None where the
-    orientation is constant."""
-    rows: Rows
-    """Points that the instrument holds."""
-    after: float
-    """Time from the start of each run at which the jaws close; the sheet is at rest before [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +58,28 @@ class Extension:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Margin:
+    """Sheet beyond the view: up to a distance around the seen points, or up to an outline."""
+
+    width: float | None
+    """Width around the rectangle of the seen points [m]; None where an outline is given."""
+    outline: Float[np.ndarray, "k 3"] | None
+    """Corners of the sheet in the world [m], in turn; None where a width is given. z is NaN where it was left out."""
+    spacing: float | None
+    """Spacing of the added vertices [m]; None for that of the seen points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """A ball in the world."""
+
+    at: Float[np.ndarray, " 3"]
+    """Centre [m]."""
+    radius: float
+    """Radius [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class MeasuredRecording:
     """Contents of a recording.toml."""
 
@@ -105,8 +89,12 @@ class MeasuredRecording:
     """Where the data come from; empty where not given."""
     unit: float
     """Metres in one unit of the data files."""
+    unit_name: str
+    """That unit."""
     period: int | None
     """Time from frame to frame [ns]; None where the frames have times."""
+    time_unit: int | None
+    """Nanoseconds in one unit of the frames' times; None where it is not given, which means seconds."""
     noise_sd: float
     """Standard deviation of each coordinate's noise [m]."""
     points: PointFiles
@@ -118,13 +106,14 @@ class MeasuredRecording:
     first_vertex: int
     """Number of the first vertex in the triangles."""
     extension: Extension | None
-    """Continuation of the sheet; None for none."""
-    grasp: Rows | GraspPath | ReportedTool
-    """What gives the position of the tool: grasped points, a straight path, or its own reports."""
-    grasp_radius: float
-    """Radius of the grip [m]."""
-    attached: Rows | float | None
-    """Truth for scoring: rows, or the station beyond which all is attached; None where the truth is unknown."""
+    """Continuation of the sheet along an axis; None for none."""
+    margin: Margin | None
+    """Continuation of the sheet all around; None for none."""
+    grasp: GraspTable
+    """The grasps, and what gives the position of the tool."""
+    attached: Rows | Region | float | None
+    """Truth for scoring: rows, a region, or the station beyond which all is attached; None where the truth is
+    unknown."""
     truth_details: dict[str, object]
     """Further entries for the truth file."""
     declaration: Declaration
@@ -138,50 +127,109 @@ def read_recording_toml(path: Path) -> MeasuredRecording:
         RecordingError: the file is missing or no TOML, a key is unknown or missing, or a value is of the wrong kind.
     """
     try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as failure:
-        raise RecordingError(f"{path} cannot be read: {failure}.") from failure
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as failure:
+        raise RecordingError(
+            f"{path} is missing; it describes the data. Let 'jiggle-mj init {path.parent}' write one, then check it."
+        ) from failure
+    except (OSError, ValueError) as failure:
+        raise RecordingError(f"{quoted(path)} cannot be read: {quoted(failure)}.") from failure
     try:
         top = StrictTable(tomllib.loads(text), str(path))
-    except tomllib.TOMLDecodeError as failure:
-        raise RecordingError(f"{path} is not TOML: {failure}.") from failure
+    except (ValueError, RecursionError) as failure:  # TOMLDecodeError, or a number of thousands of digits
+        raise RecordingError(f"{path} is not TOML: {quoted(failure)}.") from failure
     return _recording(top)
 
 
 def _recording(top: StrictTable) -> MeasuredRecording:
-    unit = top.take("unit", kinds.text)
-    if unit not in UNITS:
-        raise RecordingError(f"{top.where} unit must be one of {', '.join(UNITS)}; got '{unit}'.")
-    mesh, grasp = top.table("mesh", optional=True), top.table("grasp")
-    truth, extend = top.table("truth", optional=True), mesh.table("extend", optional=True)
+    unit = unit_of(top, "unit", LENGTH_UNITS)
+    mesh, truth = top.table("mesh", optional=True), top.table("truth", optional=True)
+    extend = mesh.table("extend", optional=True)
     points = read_points_table(top.table("points"))
     faces = mesh.take("faces", kinds.text, "none")
     recording = MeasuredRecording(
         name=top.take("name", kinds.text),
         source=top.take("source", kinds.text, ""),
-        unit=UNITS[unit],
-        period=round(top.take("period", kinds.positive) * NS_PER_S) if points.times is None else None,
+        unit=unit,
+        unit_name=top.values["unit"],
+        period=_period(top) if points.times is None else None,
+        time_unit=unit_of(top, "time_unit", TIME_UNITS) if "time_unit" in top.values else None,
         noise_sd=top.take("noise_sd", kinds.positive),
         points=points,
         frame=_frame(top.table("frame", optional=True)),
         faces=None if faces == "none" else faces,
         first_vertex=mesh.take("first_vertex", kinds.count, 0),
         extension=_extension(extend) if extend.given else None,
-        grasp_radius=grasp.take("radius", kinds.positive, DEFAULT_GRASP_RADIUS),
-        grasp=_grasp(grasp),
+        margin=_margin(mesh),
+        grasp=read_grasps(top),
         attached=_attached(truth),
-        truth_details=dict(truth.take("details", kinds.table, {})),
+        truth_details=_details(truth),
         declaration=parse_declaration_table(top.table("declaration", optional=True)),
     )
-    for table in (mesh, extend, grasp, truth, top):
+    for table in (mesh, extend, truth, top):
         table.refuse_unknown()
-    if isinstance(recording.attached, float) and recording.extension is None:
-        raise RecordingError(f"{truth.where} attached_beyond needs [mesh.extend], whose axis gives its direction.")
-    if isinstance(recording.grasp, ReportedTool) and points.times is None:
-        raise RecordingError(
-            f"{grasp.where} tool has times, so the frames need times on the same clock: give [points] times."
-        )
+    _refuse_contradictions(recording, str(top.where))
     return recording
+
+
+def _refuse_contradictions(recording: MeasuredRecording, where: str) -> None:
+    tool = recording.grasp.tool
+    if isinstance(recording.attached, float) and recording.extension is None:
+        raise RecordingError(f"{where} [truth] attached_beyond needs [mesh.extend], whose axis gives its direction.")
+    if recording.extension is not None and recording.margin is not None:
+        raise RecordingError(f"{where} has both [mesh.extend] and [mesh] margin or outline; give one.")
+    if recording.points.times is None and recording.time_unit is not None:
+        raise RecordingError(f"{where} time_unit is that of [points] times, which is missing; period is in seconds.")
+    if tool is not None and tool.times is not None and recording.points.times is None:
+        raise RecordingError(
+            f"{where} [grasp] tool has times, so the frames need times on the same clock: give [points] times."
+        )
+
+
+def _period(top: StrictTable) -> int:
+    seconds = top.take("period", kinds.positive)
+    if not MIN_PERIOD <= seconds <= MAX_PERIOD:
+        raise RecordingError(
+            f"{top.where} period is {seconds:g} s; from {MIN_PERIOD:g} to {MAX_PERIOD:g} s is allowed: is it in ms?"
+        )
+    return round(seconds * NS_PER_S)
+
+
+def _margin(mesh: StrictTable) -> Margin | None:
+    margin = Margin(
+        width=mesh.take("margin", kinds.positive, None),
+        outline=mesh.take("outline", _outline, None),
+        spacing=mesh.take("spacing", kinds.positive, None),
+    )
+    if margin.width is not None and margin.outline is not None:
+        raise RecordingError(f"{mesh.where} has both margin and outline; give one.")
+    if margin.width is None and margin.outline is None:
+        if margin.spacing is not None:
+            raise RecordingError(f"{mesh.where} spacing is that of added vertices: give margin or outline as well.")
+        return None
+    return margin
+
+
+def _outline(value: Any) -> Float[np.ndarray, "k 3"]:
+    kind = f"a list of 3 to {MAX_OUTLINE_POINTS} corners, all [x, y] or all [x, y, z]"
+    if not isinstance(value, list) or not 3 <= len(value) <= MAX_OUTLINE_POINTS:
+        raise TypeError(kind)
+    lengths = {len(corner) if isinstance(corner, list) else 0 for corner in value}
+    if lengths not in ({2}, {3}):
+        raise TypeError(kind)
+    corners = np.array([[kinds.number(number) for number in corner] for corner in value])
+    return corners if lengths == {3} else np.column_stack([corners, np.full(len(corners), np.nan)])
+
+
+def _details(truth: StrictTable) -> dict[str, object]:
+    details = dict(truth.take("details", kinds.table, {}))
+    try:
+        json.dumps(details, allow_nan=False)
+    except (TypeError, ValueError, RecursionError) as failure:
+        raise RecordingError(f"{truth.where} details must hold texts and finite numbers: {quoted(failure)}.") from (
+            failure
+        )
+    return details
 
 
 def _frame(table: StrictTable) -> WorldFrame:
@@ -206,46 +254,16 @@ def _extension(table: StrictTable) -> Extension:
     return extension
 
 
-def _grasp(table: StrictTable) -> Rows | GraspPath | ReportedTool:
-    if "tool" in table.values:
-        return ReportedTool(
-            tool=table.take("tool", kinds.text),
-            times=table.take("tool_times", kinds.text),
-            orientations=table.take("tool_turns", kinds.text, None),
-            rows=_required_rows(table),
-            after=table.take("after", kinds.number, 0.0),
-        )
-    table.known |= {"tool", "tool_times", "tool_turns", "after"}
-    if "start" in table.values:
-        return GraspPath(
-            start=np.array(table.take("start", kinds.vector)),
-            direction=table.direction("direction"),
-            step=table.take("step", kinds.number),
-        )
-    table.known |= {"start", "direction", "step"}
-    return _required_rows(table)
-
-
-def _required_rows(table: StrictTable) -> Rows:
-    rows = _rows(table, "rows")
-    if rows is None:
-        raise RecordingError(f"{table.where} needs rows or rows_file, or start, direction and step.")
-    return rows
-
-
-def _attached(table: StrictTable) -> Rows | float | None:
-    beyond, rows = table.take("attached_beyond", kinds.number, None), _rows(table, "attached_rows")
-    if beyond is not None and rows is not None:
-        raise RecordingError(f"{table.where} has both attached_beyond and attached_rows; give one.")
+def _attached(table: StrictTable) -> Rows | Region | float | None:
+    beyond, rows = table.take("attached_beyond", kinds.number, None), read_choice(table, "attached_rows")
+    at, within = table.take("attached_at", kinds.vector, None), table.take("attached_within", kinds.positive, None)
+    if (beyond is not None) + (rows is not None) + (at is not None) > 1:
+        raise RecordingError(f"{table.where} has several of attached_beyond, attached_rows and attached_at; give one.")
+    if (at is None) != (within is None):
+        raise RecordingError(f"{table.where} attached_at and attached_within need each other.")
+    if at is not None and within is not None:
+        return Region(at=np.array(at), radius=within)
     return rows if beyond is None else float(beyond)
-
-
-def _rows(table: StrictTable, name: str) -> Rows | None:
-    rows, file = table.take(name, kinds.counts, None), table.take(f"{name}_file", kinds.text, None)
-    first = table.take(f"{name}_first", kinds.count, 0)
-    if rows is not None and file is not None:
-        raise RecordingError(f"{table.where} has both {name} and {name}_file; give one.")
-    return None if rows is None and file is None else Rows(rows=tuple(rows or ()), file=file, first=first)
 
 
 def parse_declaration_table(table: StrictTable) -> Declaration:

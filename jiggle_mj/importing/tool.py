@@ -1,49 +1,17 @@
-"""Position of the tool in each frame of measured data: at the grasped points, on a given path, or from its reports.
+"""Position of the tool in each frame of measured data: at the grasped points, on a given path, or from its reports."""
 
-Between two reports the position is interpolated linearly; nothing else is filled in.
-"""
-
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation, Slerp
 
-from ..errors import RecordingError
 from ..observation import IDENTITY_WXYZ, ToolReport, ToolState
-from ..recording.schemas import NS_PER_S
+from .clock import FrameClock
 from .data_folder import DataFolder
-from .declaration import GraspPath, MeasuredRecording, ReportedTool, Rows
-from .point_files import read_rows
-from .points.archives import read_array
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reports:
-    """Reports of an instrument."""
-
-    times: Int[np.ndarray, " r"]
-    """Times of the reports, from the first frame [ns]."""
-    positions: Float[np.ndarray, "r 3"]
-    """Reported positions in the world [m]."""
-    orientations: Slerp
-    """Orientation in the world by time [ns]."""
-    after: int
-    """Time from the start of each run at which the jaws close [ns]."""
-
-    def between(self, begin: int, end: int) -> tuple[ToolReport, ...]:
-        """Return the reports within an open interval [ns]."""
-        inside = (self.times > begin) & (self.times < end)
-        return tuple(
-            ToolReport(time=int(time), position=position)
-            for time, position in zip(self.times[inside], self.positions[inside], strict=True)
-        )
-
-    def at(self, time: int) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 4"]]:
-        """Return position [m] and orientation wxyz at a time [ns]."""
-        clipped = np.clip(time, self.times[0], self.times[-1])
-        position = np.array([np.interp(clipped, self.times, self.positions[:, k]) for k in range(3)])
-        return position, self.orientations(clipped).as_quat(scalar_first=True)
+from .declaration import MeasuredRecording
+from .grasp_checks import refuse_wrong_grasps
+from .grasps import Grasp, read_grasps
+from .reports import Reports, read_reports
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,98 +22,120 @@ class Tool:
     """Contents of the recording.toml."""
     rest: Float[np.ndarray, "n 3"]
     """Positions of the points in the first frame, in the world [m]."""
-    held: Int[np.ndarray, " h"] = field(default_factory=lambda: np.empty(0, int))
-    """Rows of the grasped points; empty where a path is given."""
-    reports: Reports | None = None
+    steps: list[int]
+    """Number of each frame, counted from the rest frame."""
+    clock: FrameClock
+    """Times and runs of the frames."""
+    grasps: tuple[Grasp, ...]
+    """The grasps; none on a path."""
+    reports: Reports | None
     """Reports of the instrument; None where it has none."""
 
     @classmethod
     def read(
-        cls, folder: DataFolder, given: MeasuredRecording, rest: Float[np.ndarray, "n 3"], *, name: str, origin: float
+        cls,
+        folder: DataFolder,
+        given: MeasuredRecording,
+        frames: Float[np.ndarray, "t n 3"],
+        *,
+        names: list[str],
+        steps: list[int],
+        clock: FrameClock,
+        vertices: Float[np.ndarray, "v 3"] | None,
     ) -> "Tool":
         """Read the tool from the data files.
 
         Args:
             folder: folder of the data files.
             given: contents of the recording.toml.
-            rest: positions of the points in the first frame, in the world [m].
-            name: name of that frame.
-            origin: time of that frame on the clock of the data [s].
+            frames: positions of the points in the world [m], the rest frame first.
+            names: names of the frames.
+            steps: number of each frame, counted from the rest frame.
+            clock: times and runs of the frames.
+            vertices: vertices of the declared mesh [m]; None without one.
 
         Raises:
-            RecordingError: rows or arrays are missing or malformed, or no grasped point is seen at rest.
+            RecordingError: rows or arrays are missing or malformed, no grasped point is seen at rest, or the tool
+                does not hold the named points.
         """
-        grasp = given.grasp
-        if isinstance(grasp, GraspPath):
-            return cls(given=given, rest=rest)
-        rows = grasp.rows if isinstance(grasp, ReportedTool) else grasp
-        held = read_rows(folder, rows, len(rest), "grasp")
-        if not np.isfinite(rest[held]).all(axis=1).any():
-            raise RecordingError(
-                f"the rest frame {name} shows none of the {len(held)} grasped points, so the first position of the "
-                "tool is unknown; choose another rest, or give the path in [grasp]."
+        reports = None if given.grasp.tool is None else read_reports(folder, given, given.grasp.tool, clock)
+        grasps: tuple[Grasp, ...] = ()
+        if given.grasp.path is None:
+            numbers = [step + given.points.rest for step in steps]
+            grasps = read_grasps(
+                folder,
+                given,
+                frames,
+                names=names,
+                numbers=numbers,
+                clock=clock,
+                reports=reports,
+                vertices=vertices,
             )
-        reports = _reports(folder, given, grasp, origin) if isinstance(grasp, ReportedTool) else None
-        return cls(given=given, rest=rest, held=held, reports=reports)
+            refuse_wrong_grasps(given, frames, grasps, reports, clock)
+        return cls(given=given, rest=frames[0], steps=steps, clock=clock, grasps=grasps, reports=reports)
 
-    def is_unknown(self, positions: Float[np.ndarray, "n 3"]) -> bool:
-        """Return whether the tool's position in a frame is unknown: no grasped point is seen."""
-        if self.reports is not None or not len(self.held):
-            return False
-        return not np.isfinite(positions[self.held] - self.rest[self.held]).all(axis=1).any()
+    @property
+    def n_held(self) -> int:
+        """Return the number of points that are held at some time."""
+        return len(np.unique(np.concatenate([np.empty(0, int), *(grasp.held for grasp in self.grasps)])))
 
-    def state(self, *, step: int, time: int, run: int, began: int, positions: Float[np.ndarray, "n 3"]) -> ToolState:
+    def why_unknown(self, frame: int, positions: Float[np.ndarray, "n 3"]) -> str | None:
+        """Return why the tool's position in a frame is unknown; None where it is known."""
+        if self.reports is not None:
+            return None if self.reports.covers(self.clock.times[frame]) else "the tool reports at other times only"
+        if self.given.grasp.path is not None:
+            return None
+        held = self._held(frame)
+        seen = np.isfinite(positions[held] - self.rest[held]).all(axis=1).any()
+        return None if seen else "no grasped point seen"
+
+    def reported(self, begin: int, end: int) -> tuple[ToolReport, ...]:
+        """Return the reports within an open interval [ns]."""
+        return () if self.reports is None else self.reports.between(begin, end)
+
+    def state(self, frame: int, positions: Float[np.ndarray, "n 3"]) -> ToolState:
         """Return the state of the tool in one frame.
 
         Args:
-            step: number of frames after the rest frame.
-            time: time of the frame [ns].
-            run: number of the run, from 1.
-            began: time at which the run began [ns].
+            frame: number of the frame, the rest frame first.
             positions: positions of the points in the world [m].
         """
-        grasp, quat_wxyz, closed = self.given.grasp, IDENTITY_WXYZ, True
+        table, quat_wxyz = self.given.grasp, IDENTITY_WXYZ
         if self.reports is not None:
-            tip, quat_wxyz = self.reports.at(time)
-            closed = time - began >= self.reports.after
-        elif isinstance(grasp, GraspPath):
-            tip = grasp.start + step * grasp.step * grasp.direction
+            tip, quat_wxyz = self.reports.at(self.clock.times[frame])
+        elif table.path is not None:
+            tip = table.path.start + self.steps[frame] * table.path.step * table.path.direction
         else:
-            displacement = np.nanmean(positions[self.held] - self.rest[self.held], axis=0)
-            tip = np.nanmean(self.rest[self.held], axis=0) + displacement
+            held = self._held(frame)
+            displacement = np.nanmean(positions[held] - self.rest[held], axis=0)
+            tip = np.nanmean(self.rest[held], axis=0) + displacement
+        if table.path is not None:
+            closed, number, radius, tracks = True, self.clock.runs[frame], table.path_radius, ()
+        else:
+            closed, number, radius, tracks = self._grip(frame)
         return ToolState(
             position=tip,
             quat_wxyz=quat_wxyz,
             closed=closed,
-            grasp=run if closed else run - 1,
-            radius=self.given.grasp_radius,
-            held_tracks=tuple(self.held.tolist()),
-            by_points=isinstance(grasp, Rows),
+            grasp=number,
+            radius=radius,
+            held_tracks=tracks,
+            by_points=self.reports is None and table.path is None,
         )
 
+    def _grip(self, frame: int) -> tuple[bool, int, float, tuple[int, ...]]:
+        """Return whether the jaws are closed, the number of the grasp, its radius, and the held tracks."""
+        grasp = self._grasp(frame)
+        within = grasp.frames[0] <= frame < grasp.frames[1]
+        closed = within and grasp.is_closed(frame)
+        ended = grasp.frames[1] <= frame
+        number = grasp.number if closed or ended else grasp.number - 1
+        return closed, number, grasp.given.radius, tuple(grasp.held.tolist())
 
-def _reports(folder: DataFolder, given: MeasuredRecording, grasp: ReportedTool, origin: float) -> Reports:
-    archive, frame = folder / given.points.files[0], given.frame
-    seconds, positions = read_array(archive, grasp.times), read_array(archive, grasp.tool)
-    count = len(seconds)
-    if positions.shape != (count, 3) or count < 2 or not (np.diff(seconds) > 0).all():
-        raise RecordingError(
-            f"{archive}: {grasp.tool} must have shape (reports, 3) and {grasp.times} (reports,), increasing; they have "
-            f"{positions.shape} and {seconds.shape}."
-        )
-    quaternions = np.tile(IDENTITY_WXYZ, (count, 1))
-    if grasp.orientations is not None:
-        quaternions = read_array(archive, grasp.orientations)
-    if quaternions.shape != (count, 4):
-        raise RecordingError(
-            f"{archive}: {grasp.orientations} must have shape ({count}, 4), w first; it has {quaternions.shape}."
-        )
-    times = np.round((seconds - origin) * NS_PER_S).astype(np.int64)
-    return Reports(
-        times=times,
-        positions=positions * given.unit @ frame.rotation.T + frame.translation,
-        orientations=Slerp(
-            times, Rotation.from_matrix(frame.rotation) * Rotation.from_quat(quaternions, scalar_first=True)
-        ),
-        after=round(grasp.after * NS_PER_S),
-    )
+    def _grasp(self, frame: int) -> Grasp:
+        """Return the grasp of a frame, the next one where the jaws are open, or the last."""
+        return next((grasp for grasp in self.grasps if frame < grasp.frames[1]), self.grasps[-1])
+
+    def _held(self, frame: int) -> Int[np.ndarray, " h"]:
+        return self._grasp(frame).held

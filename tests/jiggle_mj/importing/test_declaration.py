@@ -10,7 +10,7 @@ from tests.support.measured_folder import TOML, bring_in, folder
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('unit = "mm"', 'unit = "inch"', "unit must be one of m, cm, mm; got 'inch'"),
+        ('unit = "mm"', 'unit = "inch"', "unit must be one of m, cm, mm, um; got 'inch'"),
         ('unit = "mm"', "", "lacks the key 'unit'"),
         ("period = 0.5", "period = 0", "period must be a number above 0; got 0"),
         ('name = "grid"', "name = 3", "name must be a text; got 3"),
@@ -18,20 +18,20 @@ from tests.support.measured_folder import TOML, bring_in, folder
         (
             "rows = [0, 1]",
             "rows = [0, 1]\ntip = 3",
-            r"\[grasp\] has the unknown key 'tip'; known: after, direction, radius",
+            r"\[grasp\] has the unknown key 'tip'; known: after, at, begin, direction",
         ),
         ("bed = false", "bed = 0", r"\[declaration\] bed must be true or false; got 0"),
         ("bed = false", "youngs = 3.0", r"\[declaration\] has the unknown key 'youngs'; known: areal_density"),
         ("bed = false", "poisson = 0.5", r"\[declaration\] Declaration.poisson must be in \[0, 0.5\)"),
         ("bed = false", "thickness = 0", r"\[declaration\] Declaration.thickness must be above 0"),
-        ("rows = [0, 1]", "", r"\[grasp\] needs rows or rows_file, or start, direction and step"),
+        ("rows = [0, 1]", "", r"\[grasp\] needs one of rows, rows_file, at"),
         ("rows = [0, 1]", 'rows = [0]\nrows_file = "r"', "both rows and rows_file"),
-        ("rows = [0, 1]", "rows = [12]", r"grasp names row 12; rows are numbered 0\.\.11"),
-        ("rows = [0, 1]", "rows = []", "grasp names row none"),
+        ("rows = [0, 1]", "rows = [12]", r"names row 12; rows are numbered 0\.\.11"),
+        ("rows = [0, 1]", "rows = []", "names row none"),
         ("rows = [0, 1]", 'rows_file = "rest.xyz"', "must hold whole numbers"),
         ("attached_rows = [11, 12]", "attached_rows = [0]", r"\[truth\] names row 0; rows are numbered 1\.\.12"),
         ("attached_rows = [11, 12]", "attached_beyond = 1.0", r"\[truth\] attached_beyond needs \[mesh.extend\]"),
-        ("[truth]", "[truth]\nattached_beyond = 1.0", "both attached_beyond and attached_rows"),
+        ("[truth]", "[truth]\nattached_beyond = 1.0", "several of attached_beyond, attached_rows and attached_at"),
         ('files = ["rest.xyz", "pulled_*.xyz"]', "files = []", "needs at least one file"),
         ('files = ["rest.xyz", "pulled_*.xyz"]', 'key = "p"\nfiles = ["a.xyz"]', "key names the array of an .npz"),
         ('files = ["rest.xyz", "pulled_*.xyz"]', 'files = ["none_*.xyz"]', "no file that matches 'none_"),
@@ -52,5 +52,5 @@ def test_a_wrong_toml_is_refused_with_key_value_and_what_is_allowed(tmp_path, ol
 
 
 def test_a_missing_toml_is_refused(tmp_path):
-    with pytest.raises(RecordingError, match=r"recording\.toml cannot be read"):
+    with pytest.raises(RecordingError, match=r"recording\.toml is missing.*jiggle-mj init"):
         import_folder(tmp_path, None, tmp_path / "run.mcap")

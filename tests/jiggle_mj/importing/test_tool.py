@@ -60,14 +60,15 @@ attached_rows = []
 
 
 def reported_folder(tmp_path: Path, *, toml: str = REPORTED, **arrays) -> Path:
-    """Two runs of three frames at 2 Hz, and a tool that moves along x at 10 mm/s and rotates about z at 0.1 rad/s."""
+    """Two runs of three frames at 2 Hz; points and tool move along x at 10 mm/s, and it rotates about z at 0.1 rad/s."""
     where = tmp_path / "data"
     where.mkdir()
     at = np.arange(0, 4.01, 0.2)
     quaternions = np.column_stack([np.cos(0.05 * at), 0 * at, 0 * at, np.sin(0.05 * at)])
+    seconds = np.array([0.0, 0.5, 1.0, 2.0, 2.5, 3.0])
     given = {
-        "p": np.tile(grid(), (6, 1, 1)),
-        "t": 7.0 + np.array([0.0, 0.5, 1.0, 2.0, 2.5, 3.0]),
+        "p": grid() + 10 * seconds[:, np.newaxis, np.newaxis] * [1, 0, 0],
+        "t": 7.0 + seconds,
         "r": np.array([1, 1, 1, 2, 2, 2]),
         "tip": np.column_stack([10 * at, 0 * at, 0 * at]),
         "at": 7.0 + at,
@@ -108,7 +109,7 @@ def test_runs_with_a_tool_that_reported_become_grasps(tmp_path):
         (('times = "t"', 'times = "u"'), {}, "has no array 'u'"),
         (("", ""), {"t": np.zeros(6)}, "times must increase"),
         (("", ""), {"r": np.zeros(5)}, "one entry for each of the 6 frames"),
-        (("", ""), {"at": np.zeros(21)}, r"at \(reports,\), increasing"),
+        (("", ""), {"at": np.zeros(21)}, r"at \(reports,\) must increase; entry 1 is 0.0 after 0.0"),
         (("", ""), {"turn": np.ones((21, 3))}, r"turn must have shape \(21, 4\), w first"),
     ],
 )
