@@ -54,6 +54,10 @@ if TYPE_CHECKING:
     from .observation import Observation as Observation
     from .observation import StereoPair as StereoPair
     from .observation import ToolState as ToolState
+    from .plausibility.problems import Problem as Problem
+    from .plausibility.problems import problems as problems
+    from .plausibility.survey import Survey as Survey
+    from .plausibility.survey import survey as survey
     from .recording.reader import Recording as Recording
     from .recording.writer import RecordingWriter as RecordingWriter
     from .series import RecordingSeries as RecordingSeries
@@ -86,6 +90,7 @@ __all__ = [
     "OptionError",
     "OutputError",
     "PerceptionError",
+    "Problem",
     "Recording",
     "RecordingError",
     "RecordingSeries",
@@ -99,6 +104,7 @@ __all__ = [
     "SimulationError",
     "StereoCamera",
     "StereoPair",
+    "Survey",
     "Suture",
     "ToolState",
     "Wait",
@@ -107,12 +113,14 @@ __all__ = [
     "close_loop",
     "import_folder",
     "load_scene",
+    "problems",
     "programme",
     "record_series",
     "run_estimator",
     "run_scene",
     "score",
     "shipped_scenes",
+    "survey",
 ]
 
 _NAMES_OF_MODULE = {
@@ -140,6 +148,8 @@ _NAMES_OF_MODULE = {
     "importing.folder": ("import_folder",),
     "material": ("Material",),
     "observation": ("Declaration", "DeclaredMesh", "MeasuredPoints", "Observation", "StereoPair", "ToolState"),
+    "plausibility.problems": ("Problem", "problems"),
+    "plausibility.survey": ("Survey", "survey"),
     "recording.reader": ("Recording",),
     "recording.writer": ("RecordingWriter",),
     "series": ("RecordingSeries", "record_series"),

@@ -45,7 +45,7 @@ class RecordingContents:
         refuse_bag(path)
         self.path, self._allow_truncated = path, allow_truncated
         self.metadata: dict[str, str] = {}
-        self.declaration = Declaration()
+        self.declaration, self.declared = Declaration(), False
         self.frames = FrameTree()
         self.calibrations: dict[str, CalibrationMessage] = {}
         self.poses: dict[int, PoseInFrame] = {}
@@ -135,6 +135,7 @@ class RecordingContents:
                     self.metadata = dict(record.metadata)
                 elif record.name == DECLARATION:
                     self.declaration = parse_declaration(record.metadata.get("json", ""))
+                    self.declared = True
             elif record.name == DECLARED_MESH:
                 self._declared_mesh = record
 

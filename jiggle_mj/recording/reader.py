@@ -56,6 +56,8 @@ class Recording:
     """The calibrated stereo camera; None where the recording has points only."""
     declaration: Declaration
     """What the user declared; the defaults where the file, a robot's for example, holds none."""
+    declared: bool
+    """Whether the file holds a declaration."""
     metadata: dict[str, str]
     """Versions, units, seed; empty for a file that another program wrote."""
     ignored: dict[str, int]
@@ -67,6 +69,7 @@ class Recording:
         self._contents, self._tolerance = contents, tolerance_ns
         self.camera = _read_camera(contents) if contents.has_images else None
         self.declaration, self.metadata, self.ignored = contents.declaration, contents.metadata, contents.ignored
+        self.declared = contents.declared
         self.skipped = []
         stamped = contents.stamped
         self._groups = group_messages(
@@ -123,6 +126,13 @@ class Recording:
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the usable observations in file order."""
+        return self._observations(images=True)
+
+    def without_images(self) -> Iterator[Observation]:
+        """Yield the usable observations without their images, which takes much less time; images are not checked."""
+        return self._observations(images=False)
+
+    def _observations(self, *, images: bool) -> Iterator[Observation]:
         self.skipped = []
         latest: int | None = None
         last_pose: Stamped | None = None
@@ -135,7 +145,7 @@ class Recording:
                 if latest is not None and group.stamp <= latest:
                     raise RecordingError(f"time goes backwards, from {latest} ns to {group.stamp} ns")
                 latest = group.stamp
-                observation = self._reader.read(index, group, messages)
+                observation = self._reader.read(index, group, messages, images=images)
             except RecordingError as failure:
                 self.skipped.append((index, str(failure)))
                 continue
@@ -174,27 +184,28 @@ class ObservationReader:
     max_pose_age: int
     """Age above which a tool pose no longer says where the tool is [ns]."""
 
-    def read(self, index: int, group: MessageGroup, messages: dict[str, Any]) -> Observation:
+    def read(self, index: int, group: MessageGroup, messages: dict[str, Any], *, images: bool = True) -> Observation:
         """Decode one group; its events and reports are added by `Recording`.
 
         Args:
             index: position of the group in the recording.
             group: which messages belong together.
             messages: the encoded images and points by topic.
+            images: whether to decode the images.
 
         Raises:
             RecordingError: half of a stereo pair is missing, an image cannot be decoded or has another size than its
                 calibration, a pose is not one, a frame is not joined to the world, the tool pose is missing or too old.
         """
-        images = None
-        if group.left is not None or group.right is not None:
-            images = self._images(messages)
+        pair = None
+        if images and (group.left is not None or group.right is not None):
+            pair = self._images(messages)
         points = self._points(messages[POINTS]) if POINTS in messages else None
         return Observation(
             index=index,
             time=group.stamp - self.origin,
             tool=self._tool(group),
-            images=images,
+            images=pair,
             points=points,
         )
 

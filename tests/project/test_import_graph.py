@@ -27,6 +27,7 @@ LAYER = {
     "jiggle_mj.estimator": "estimator",
     "jiggle_mj.truth": "truth",
     "jiggle_mj.recording": "files",
+    "jiggle_mj.plausibility": "files",
     "jiggle_mj.recording.truth": "truth",
     "jiggle_mj.doctor": "doctor",
 }

@@ -1,0 +1,238 @@
+"""The survey of a recording: its size, times, motion and noise in numbers, from one pass and no estimator.
+
+Images are not decoded, so a survey takes about as long as reading the file.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ..camera import StereoCamera
+from ..observation import Observation, ToolState
+from ..recording.reader import Recording
+from .point_motion import PointMotion, common, extent, nearest_distance, spacing
+
+COMPARED_FRAMES = 40
+"""Most frames in which points are compared with their neighbours, evenly over the recording, which bounds the time."""
+NS = 1e-9
+"""Seconds in a nanosecond [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """What a recording holds, in numbers. None: it cannot be known from what the recording has."""
+
+    sensing: Literal["stereo", "points", "cloud", "nothing"]
+    """What is seen: stereo images, points with identities, or points without; nothing if no frame can be used."""
+    frames: int
+    """Usable frames."""
+    skipped: int
+    """Frames that cannot be used."""
+    span_s: float
+    """Time from the first usable frame to the last [s]."""
+    period_s: float | None
+    """Median time from frame to frame [s]."""
+    largest_gap_s: float | None
+    """Longest time from frame to frame while one grasp holds [s]."""
+    points: int | None
+    """Points in the first frame that has any."""
+    extent_m: float | None
+    """Longest side of the box around the points at rest [m]."""
+    spacing_m: float | None
+    """Median distance of a point to its nearest neighbour at rest [m]."""
+    unseen: float | None
+    """Share of the points that are not seen, over all frames."""
+    points_motion_m: float | None
+    """Largest distance of the points from where they were first; 95th percentile over the points [m]."""
+    held_motion_m: float | None
+    """Largest mean displacement of the held points since the jaws closed [m]."""
+    missing_tracks: tuple[int, ...]
+    """Held tracks that no point has."""
+    grasps: int
+    """Number of grasps with closed jaws."""
+    closed_frames: int
+    """Frames with closed jaws."""
+    tool_by_points: bool
+    """Whether the tool's position is only that of the held points."""
+    tool_distance_m: float | None
+    """Largest distance of the tool from what it holds when the jaws close [m]."""
+    tool_motion_m: float
+    """Largest distance of the tool from where the jaws closed, while they are closed [m]."""
+    tool_path_m: float
+    """Length of the tool's path while the jaws are closed [m]."""
+    tool_speed_m_s: float | None
+    """Largest speed of the tool from frame to frame while the jaws are closed [m/s]."""
+    tool_gap_m: float | None
+    """Largest difference of the tool's displacement and that of the held points, since the jaws closed [m]."""
+    declared_sd_m: float | None
+    """Noise of a coordinate as the recording states it [m]."""
+    noise_sd_m: float | None
+    """Noise of a coordinate as it is measured [m]."""
+    noise_from: Literal["still frames", "neighbours"] | None
+    """What it is measured from: frames before the jaws close, or how single points stray from their neighbours."""
+    image_size: tuple[int, int] | None
+    """Width and height of the images [px]."""
+    baseline_m: float | None
+    """Distance between the two cameras [m]."""
+    tool_depth_m: float | None
+    """Median distance of the tool from the camera, along its optical axis, when the jaws close [m]."""
+    tool_disparity_px: float | None
+    """Disparity at that distance [px]."""
+    tool_in_view: bool | None
+    """Whether the tool is inside the left image whenever the jaws close."""
+    declared: bool
+    """Whether the recording declares the tissue; else the defaults hold."""
+
+
+@dataclass(kw_only=True)
+class _Closed:
+    """The tool while the jaws are closed."""
+
+    grasps: set[int] = field(default_factory=set)
+    frames: int = 0
+    motion: float = 0.0
+    path: float = 0.0
+    speed: float | None = None
+    gap: float | None = None
+    held: float | None = None
+    largest_gap_ns: int | None = None
+    by_points: bool = False
+    distances: list[float] = field(default_factory=list)
+    closings: list[ToolState] = field(default_factory=list)
+    _last: Observation | None = None
+
+    def begins(self, observation: Observation) -> bool:
+        """Return whether the jaws close in this frame."""
+        tool = observation.tool
+        return tool.closed and (self._last is None or not self._last.tool.closed or self._last.tool.grasp != tool.grasp)
+
+    def add(self, observation: Observation, held: Float[np.ndarray, " 3"], at_closing: Float[np.ndarray, " 3"]) -> None:
+        """Take one frame.
+
+        Args:
+            observation: the frame.
+            held: displacement of the held points since the jaws closed [m], NaN if unknown.
+            at_closing: where they were then [m].
+        """
+        tool, last = observation.tool, self._last
+        if not tool.closed:
+            self._last = observation
+            return
+        if self.begins(observation):
+            self.closings.append(tool)
+        elif last is not None:
+            step, lasted = float(np.linalg.norm(tool.position - last.tool.position)), observation.time - last.time
+            self.path += step
+            self.largest_gap_ns = max(self.largest_gap_ns or 0, lasted)
+            if lasted > 0:
+                self.speed = max(self.speed or 0.0, step / (lasted * NS))
+        closing = self.closings[-1]
+        moved = tool.position - closing.position
+        self.motion = max(self.motion, float(np.linalg.norm(moved)))
+        if np.isfinite(held).all():
+            self.held = max(self.held or 0.0, float(np.linalg.norm(held)))
+            turned = (_rotation(tool) * _rotation(closing).inv()).apply(at_closing - closing.position)
+            carried = moved + turned - (at_closing - closing.position)
+            # A tool whose offset from the held points is not rigid is judged by its displacement alone.
+            gap = min(float(np.linalg.norm(held - each)) for each in (moved, carried))
+            self.gap = max(self.gap or 0.0, gap)
+        self.grasps.add(tool.grasp)
+        self.frames += 1
+        self.by_points |= tool.by_points
+        self._last = observation
+
+
+def survey(recording: Recording) -> Survey:
+    """Return what a recording holds in numbers, from one pass over its usable frames.
+
+    Args:
+        recording: an open recording; iterating it anew afterwards begins at its first frame.
+    """
+    motion, closed, times = PointMotion(), _Closed(), list[int]()
+    stride = max(1, len(recording) // COMPARED_FRAMES)
+    first_cloud: Float[np.ndarray, "m 3"] | None = None
+    declared_sd: float | None = None
+    identified = False
+    for observation in recording.without_images():
+        times.append(observation.time)
+        points, held = observation.points, np.full(3, np.nan)
+        if points is not None and len(points.positions):
+            declared_sd = points.sd if declared_sd is None else declared_sd
+            identified |= points.track_id is not None
+            if closed.begins(observation):
+                closed.distances.append(
+                    nearest_distance(points.positions, observation.tool.position)
+                    if points.track_id is None
+                    else motion.close(points, observation.tool)
+                )
+            if points.track_id is not None:
+                still, compare = not closed.frames and not observation.tool.closed, len(times) % stride == 0
+                held = motion.add(points, observation.tool, still=still, compare=compare)
+            first_cloud = points.positions if first_cloud is None else first_cloud
+        closed.add(observation, held, motion.held_at_closing)
+    rest = motion.rest if motion.rest is not None else first_cloud
+    if motion.still_sd is not None:
+        noise_sd, noise_from = motion.still_sd, "still frames"
+    else:
+        noise_sd, noise_from = motion.neighbour_sd, None if motion.neighbour_sd is None else "neighbours"
+    steps = np.diff(times)
+    seen = "points" if identified else "cloud" if first_cloud is not None else "nothing"
+    depth, disparity, in_view = _in_camera(recording.camera, [tool.position for tool in closed.closings])
+    distances = [distance for distance in closed.distances if np.isfinite(distance)]
+    left = None if recording.camera is None else recording.camera.left
+    return Survey(
+        sensing="stereo" if recording.camera is not None and times else seen,
+        frames=len(times),
+        skipped=len(recording.skipped),
+        span_s=(times[-1] - times[0]) * NS if times else 0.0,
+        period_s=float(np.median(steps)) * NS if len(steps) else None,
+        largest_gap_s=None if closed.largest_gap_ns is None else closed.largest_gap_ns * NS,
+        points=None if rest is None else len(rest),
+        extent_m=None if rest is None else extent(rest),
+        spacing_m=None if rest is None else spacing(rest),
+        unseen=1 - motion.n_seen / motion.n_expected if motion.n_expected else None,
+        points_motion_m=motion.largest if motion.n_expected else None,
+        held_motion_m=closed.held,
+        missing_tracks=motion.missing_tracks,
+        grasps=len(closed.grasps),
+        closed_frames=closed.frames,
+        tool_by_points=closed.by_points,
+        tool_distance_m=max(distances) if distances else None,
+        tool_motion_m=closed.motion,
+        tool_path_m=closed.path,
+        tool_speed_m_s=closed.speed,
+        tool_gap_m=closed.gap,
+        declared_sd_m=declared_sd,
+        noise_sd_m=noise_sd,
+        noise_from=noise_from,
+        image_size=None if left is None else (left.width, left.height),
+        baseline_m=None if recording.camera is None else recording.camera.baseline,
+        tool_depth_m=depth,
+        tool_disparity_px=disparity,
+        tool_in_view=in_view,
+        declared=recording.declared,
+    )
+
+
+def _in_camera(
+    camera: StereoCamera | None, places: list[Float[np.ndarray, " 3"]]
+) -> tuple[float | None, float | None, bool | None]:
+    """Return the median depth of places [m], the disparity there [px], and whether all are in the left image."""
+    if camera is None or not places:
+        return None, None, None
+    world = np.array(places)
+    T = np.linalg.inv(camera.T_world_camera)
+    depths = (world @ T[:3, :3].T + T[:3, 3])[:, 2]
+    depth = common(depths.tolist())
+    if depth is None or (depths <= 0).any():
+        return depth, None, False
+    uvd = camera.project(world)
+    inside = (uvd[:, :2] >= 0).all() and (uvd[:, :2] < (camera.left.width, camera.left.height)).all()
+    return depth, camera.focal[0] * camera.baseline / depth, bool(inside)
+
+
+def _rotation(tool: ToolState) -> Rotation:
+    return Rotation.from_quat(tool.quat_wxyz, scalar_first=True)
