@@ -13,7 +13,8 @@ from ... import toml_kinds as kinds
 from ...errors import OptionError, RecordingError
 from ...observation import Declaration
 from ...toml_kinds import StrictTable
-from ..declaration import DEFAULT_GRASP_RADIUS, parse_declaration_table
+from ..declaration import parse_declaration_table
+from ..grasp_table import DEFAULT_GRASP_RADIUS
 from .gripper import ClosedRule
 
 Role = Literal["left", "right", "left_info", "right_info", "tool", "gripper", "points", "depth", "depth_info", "force"]
