@@ -154,11 +154,12 @@ def _held(
         if not len(held):
             raise RecordingError(
                 f"{table.where} holds nothing: in {names[closing]} no point lies within the radius of "
-                f"{table.radius * 1e3:.3g} mm around {np.round(centre, 4).tolist()} m; the nearest is {np.nanmin(distance) * 1e3:.3g} mm away."
+                f"{table.radius * 1e3:.3g} mm around {np.round(centre, 4).tolist()} m; the nearest is "
+                f"{np.nanmin(distance) * 1e3:.3g} mm away."
             )
     if not np.isfinite(frames[0][held]).all(axis=1).any():
         raise RecordingError(
-            f"{table.where}: the rest frame {names[0]} shows none of the {len(held)} grasped points, so the first position "
-            "of the tool is unknown; choose another rest, or give the path in [grasp]."
+            f"{table.where}: the rest frame {names[0]} shows none of the {len(held)} grasped points, so the tool's "
+            "first position is unknown; choose another rest, or give the path in [grasp]."
         )
     return held
