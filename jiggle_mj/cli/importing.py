@@ -59,7 +59,7 @@ def import_(
         allow_outside: of a folder: read data files outside it where the TOML names them.
         as_json: print a summary to stdout as JSON.
     """
-    from ..importing.bags.bag_file import is_bag
+    from ..importing.bags.bag_paths import is_bag
 
     options = {
         "topic": topic,

@@ -7,8 +7,8 @@ of it is read, so a definition that nobody needs cannot stop an import.
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -19,17 +19,10 @@ from mcap.records import Channel, Message, Schema
 
 from ...errors import RecordingError
 from ...recording.mcap_files import iterate_records
+from .bag_paths import bag_files, refuse_cut_database, refusing
 
-STORAGE_SUFFIXES = (".mcap", ".db3")
-"""Suffixes of the files that a ROS 2 bag consists of."""
 ROS_ENCODINGS = ("cdr", "ros1")
 """Encodings of the messages of ROS 2 and ROS 1."""
-SQLITE_HEADER = 100
-"""Bytes of the header of an SQLite file."""
-SHOWN_NAMES, SHOWN_NAME = 16, 80
-"""How many names a message lists, and how many characters of each."""
-SHOWN_REASON = 200
-"""Characters of a library's own reason that a message shows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,22 +57,6 @@ class BagMessage:
     """The message, with the fields of its definition."""
 
 
-def listed(names: Iterable[str]) -> str:
-    """Return names for a message: the first `SHOWN_NAMES`, shortened to `SHOWN_NAME` characters each."""
-    every = list(names)
-    more = f" and {len(every) - SHOWN_NAMES} more" if len(every) > SHOWN_NAMES else ""
-    return (", ".join(name[:SHOWN_NAME] for name in every[:SHOWN_NAMES]) + more) or "none"
-
-
-def is_bag(path: Path) -> bool:
-    """Return whether a path looks like a ROS bag: one of its files, or a folder of them without a recording.toml."""
-    if path.is_dir():
-        return not (path / "recording.toml").exists() and (
-            (path / "metadata.yaml").exists() or bool(_storage_files(path)) or any(path.glob("*.bag"))
-        )
-    return path.suffix in (*STORAGE_SUFFIXES, ".bag", ".active", ".zstd")
-
-
 class Bag:
     """A ROS bag that is open for reading.
 
@@ -93,10 +70,10 @@ class Bag:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._stack = ExitStack()
-        with _refusing(path):
-            files = _bag_files(path)
+        with refusing(path):
+            files = bag_files(path)
             for file in files:
-                _refuse_cut_database(file)
+                refuse_cut_database(file)
             self._sources = [self._open(file) for file in files]
 
     def __enter__(self) -> Self:
@@ -109,7 +86,7 @@ class Bag:
     def topics(self) -> dict[str, BagTopic]:
         """Return the topics by name; one with messages of several types is refused where it is read."""
         merged: dict[str, BagTopic] = {}
-        with _refusing(self.path):
+        with refusing(self.path):
             for source in self._sources:
                 for topic in source.topics():
                     known = merged.get(topic.name)
@@ -144,7 +121,7 @@ class Bag:
         for source in self._sources if names else []:
             messages = source.messages(set(names))
             while True:
-                with _refusing(self.path):
+                with refusing(self.path):
                     item = next(messages, None)
                 if item is None:
                     break
@@ -233,7 +210,7 @@ class _Decoder:
                 f"{path}: {topic.name} is {topic.type} encoded as '{topic.encoding}'; messages of ROS 1 and ROS 2 are "
                 "read."
             )
-        with _refusing(path, f"the definition of {topic.type}"):
+        with refusing(path, f"the definition of {topic.type}"):
             self._store = _typestore(topic.type, topic.definition.strip(), topic.definition_format, topic.encoding)
         if topic.type not in self._store.fielddefs:
             raise RecordingError(
@@ -242,7 +219,7 @@ class _Decoder:
             )
 
     def decode(self, data: bytes) -> Any:
-        with _refusing(self._path, f"a message on {self._topic.name} ({self._topic.type})"):
+        with refusing(self._path, f"a message on {self._topic.name} ({self._topic.type})"):
             if self._topic.encoding == "ros1":
                 return self._store.deserialize_ros1(data, self._topic.type)
             return self._store.deserialize_cdr(data, self._topic.type)
@@ -279,74 +256,3 @@ def _mcap_topic(channel: Channel, schema: Schema | None) -> BagTopic:
         definition=text if encoding in ROS_ENCODINGS else "",
         definition_format="idl" if schema is not None and schema.encoding in ("ros2idl", "omgidl") else "msg",
     )
-
-
-def _storage_files(folder: Path) -> list[Path]:
-    """Return the storage files of a folder, in the order of counting."""
-    return _in_order(file for suffix in STORAGE_SUFFIXES for file in folder.glob(f"*{suffix}"))
-
-
-def _in_order(files: Iterable[Path]) -> list[Path]:
-    """Return files by name, with the numbers in their names in the order of counting."""
-    return sorted(files, key=lambda file: [(part.isdigit(), part.zfill(20)) for part in re.split(r"(\d+)", file.name)])
-
-
-def _bag_files(path: Path) -> list[Path]:
-    """Return what to open for a bag: the path itself, or the files of a folder that lost its metadata.yaml."""
-    try:
-        import rosbags.typesys  # noqa: F401
-    except ImportError as failure:
-        raise RecordingError(
-            f"{path}: reading ROS bags needs the library rosbags; install it: pip install 'jiggle-mj[ros]'."
-        ) from failure
-    if not path.exists():
-        raise RecordingError(f"{path} cannot be read: there is no such file or folder.")
-    if path.is_dir():
-        if (path / "metadata.yaml").exists():
-            return [path]
-        files = _storage_files(path) or _in_order(path.glob("*.bag"))
-        if not files:
-            raise RecordingError(f"{path} holds no bag: no metadata.yaml, and no .mcap, .db3 or .bag file.")
-        return files
-    if path.suffix not in (*STORAGE_SUFFIXES, ".bag"):
-        raise RecordingError(
-            f"{path} is not read as a bag: give a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag "
-            "(a file compressed by ROS 2 needs its folder; 'rosbag reindex' mends a .bag.active file, which was not "
-            "closed)."
-        )
-    return [path]
-
-
-def _refuse_cut_database(path: Path) -> None:
-    """Refuse an SQLite file that is shorter than its header says; SQLite would read what is left without a word.
-
-    Header: https://www.sqlite.org/fileformat.html, section 1.3.
-
-    Raises:
-        RecordingError: it is shorter.
-    """
-    for file in path.glob("*.db3") if path.is_dir() else [path]:
-        if file.suffix == ".db3":
-            with open(file, "rb") as stream:
-                head = stream.read(SQLITE_HEADER)
-            page_size = int.from_bytes(head[16:18], "big")
-            wanted = (65536 if page_size == 1 else page_size) * int.from_bytes(head[28:32], "big")
-            if file.stat().st_size < max(wanted, SQLITE_HEADER):
-                raise RecordingError(f"{file} is cut off: {file.stat().st_size} of {wanted} bytes are there.")
-
-
-@contextmanager
-def _refusing(path: Path, part: str = "the bag") -> Iterator[None]:
-    """Turn what the libraries raise for damaged data into one line.
-
-    Catches every Exception on purpose: a damaged bag surfaces as errors of rosbags, apsw, zstandard, lz4, struct, yaml
-    and as bare KeyErrors and assertions, and no list of them is complete.
-    """
-    try:
-        yield
-    except RecordingError:
-        raise
-    except Exception as failure:
-        cure = " 'rosbag reindex' mends a file that was not closed." if path.suffix == ".bag" else ""
-        reason = " ".join((str(failure) or type(failure).__name__).split())[:SHOWN_REASON]
-        raise RecordingError(f"{path}: {part} cannot be read ({reason}); is it damaged or cut off?{cure}") from failure

@@ -56,7 +56,10 @@ def rgb_image(message: Any) -> UInt8[np.ndarray, "height width 3"]:
         if "compressedDepth" in message.format:
             raise RecordingError("is a compressed depth image; record the depth as sensor_msgs/Image")
         packed = CompressedImage(data=np.asarray(message.data, np.uint8).tobytes(), format=message.format[:40])
-        return decode_image(packed)
+        image, pattern = decode_image(packed), message.format.partition(";")[0].strip()
+        if pattern.startswith("bayer_") and pattern in COLOURS and (image == image[..., :1]).all():
+            return cv2.cvtColor(np.ascontiguousarray(image[..., 0]), COLOURS[pattern][1])
+        return image
     encoding = DEEP.get(message.encoding, message.encoding)
     if encoding not in COLOURS:
         raise RecordingError(f"has encoding '{message.encoding[:40]}'; {', '.join([*COLOURS, *DEEP])} are read")

@@ -4,7 +4,8 @@ from collections.abc import Mapping
 
 from ...errors import RecordingError
 from ...recording.topics import GRASP, POSE
-from .bag_file import ROS_ENCODINGS, Bag, listed
+from .bag_file import ROS_ENCODINGS, Bag
+from .bag_paths import listed
 from .gripper import ALWAYS
 from .roles import TYPES, RoleChoice
 from .settings import BagSettings, Role

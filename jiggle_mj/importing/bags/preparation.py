@@ -7,9 +7,10 @@ import numpy as np
 
 from ...camera import CameraCalibration, StereoCamera
 from ...errors import RecordingError
-from ...observation import Declaration
+from ...observation import Declaration, MeasuredPoints
 from ...recording.force import ToolForce
-from .bag_file import Bag, listed
+from .bag_file import Bag
+from .bag_paths import listed
 from .calibration import CameraSource, parse_camera_info, read_camera_file, stereo_camera
 from .gripper import ALWAYS, JawState, jaw_states, jaw_value
 from .missing import missing_roles
@@ -102,6 +103,10 @@ def prepare(
     if main == "depth":
         info = survey.messages["depth_info"][0]
         depth = parse_camera_info(info, roles["depth_info"].topic, survey.frame["depth_info"]).calibration
+    if main != "left" and settings.noise_sd is None:
+        notes.append(
+            f"noise of the points: {1e3 * MeasuredPoints.sd:g} mm is assumed; say yours with [points] noise_sd in map.toml"
+        )
     frames = _frames(survey, main, settings, notes)
     stamps = [frame.stamp for frame in frames]
     tool = _tool(survey, roles, world, notes)

@@ -8,7 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ...errors import RecordingError
-from .bag_file import BagTopic, listed
+from .bag_file import BagTopic
+from .bag_paths import listed
 from .settings import ROLES, Role
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")

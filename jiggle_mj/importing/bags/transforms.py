@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ...errors import RecordingError
 from ...recording.schemas import refuse_bad_pose
-from .bag_file import listed
+from .bag_paths import listed
 
 MAX_TREMBLE_M = 2e-4
 """Largest distance of a still frame from its mean position [m]: the noise of a measured point."""
 MAX_TREMBLE_RAD = 2e-3
 """Largest rotation of a still frame from its mean [rad]: 0.2 mm at a working distance of 0.1 m."""
+MAX_DISTANCE = 1e6
+"""Largest coordinate of a pose [m]: beyond any map, and below where squares overflow."""
 MAX_TRANSFORM_GAP = 500_000_000
 """Longest time between two messages of a moving frame over which it is interpolated [ns]."""
 
@@ -212,6 +214,8 @@ def parse_ros_pose(
     if not wxyz.any():
         wxyz = np.array([1.0, 0.0, 0.0, 0.0])
     try:
+        if np.abs(xyz).max() > MAX_DISTANCE or np.abs(wxyz).max() > 2:
+            raise RecordingError(f"position {xyz.tolist()} m, quaternion wxyz {wxyz.tolist()} is no pose")
         refuse_bad_pose(xyz, wxyz)
     except RecordingError as failure:
         raise RecordingError(f"{where}: {failure}") from failure

@@ -8,7 +8,8 @@ from mcap.writer import Writer
 
 from jiggle_mj import Recording
 from jiggle_mj.errors import OutputError, RecordingError
-from jiggle_mj.importing.bags.bag_file import Bag, is_bag
+from jiggle_mj.importing.bags.bag_file import Bag
+from jiggle_mj.importing.bags.bag_paths import is_bag
 from jiggle_mj.importing.bags.importer import import_bag
 from tests.support.robot_bags import (
     EPOCH,

@@ -1,5 +1,6 @@
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -97,3 +98,17 @@ def test_depth_is_in_metres_and_zero_is_unseen():
     np.testing.assert_array_equal(depth_image(message("32FC1", metres)), [[np.nan, 0.25], [np.nan, 0.5]])
     with pytest.raises(RecordingError, match="depth is read as"):
         depth_image(message("rgb8", picture()))
+
+
+@pytest.mark.parametrize("pattern", ("rggb", "grbg"))
+def test_a_compressed_mosaic_is_demosaiced_and_a_compressed_colour_is_not(pattern: str):
+    mosaic = np.zeros((8, 10), np.uint8)
+    for place, colour in enumerate(pattern):
+        mosaic[place // 2 :: 2, place % 2 :: 2] = FLAT[colour]
+    packed = SimpleNamespace(format=f"bayer_{pattern}8; png compressed ", data=cv2.imencode(".png", mosaic)[1].ravel())
+    np.testing.assert_array_equal(rgb_image(packed)[3, 4], [200, 120, 40])
+    colour = np.full((8, 10, 3), [40, 120, 200], np.uint8)
+    packed = SimpleNamespace(
+        format=f"bayer_{pattern}8; png compressed bgr8", data=cv2.imencode(".png", colour)[1].ravel()
+    )
+    np.testing.assert_array_equal(rgb_image(packed)[3, 4], [200, 120, 40])
