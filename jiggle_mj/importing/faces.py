@@ -20,6 +20,8 @@ from .points.text_table import TextTable
 
 MAX_MATCH_SPACINGS = 0.5
 """Distance of a vertex from its point, in spacings of the vertices: beyond it another vertex may be nearer."""
+SAME_ORDER_SHARE = 0.9
+"""Share of the points that are so near to the vertex of their own number where the order is the same."""
 MAX_EDGE_ERROR = 0.1
 """Relative difference of lengths, up to one scale, by which the median edge of a mesh is still that of the points."""
 FAR_EDGE_SHARE, FAR_EDGE_POINTS = 0.25, 30
@@ -88,10 +90,10 @@ def _by_rows(path: Path, mesh: MeshFile, rest: Float[np.ndarray, "n 3"], notes: 
     farthest = MAX_MATCH_SPACINGS * spacing
     if len(vertices) == len(rest):
         apart = np.linalg.norm(vertices[seen] - rest[seen], axis=1)
-        if np.median(apart) <= farthest:
+        if np.quantile(apart, SAME_ORDER_SHARE) <= farthest:
             return faces
     distance, nearest = KDTree(vertices).query(rest[seen])
-    matched = len(set(nearest.tolist())) == len(seen) and float(np.max(distance)) <= farthest
+    matched = len(np.unique(nearest)) == len(seen) and float(np.max(distance)) <= farthest
     if not matched and len(vertices) == len(rest) and _same_edges(vertices, rest, faces):
         return faces
     if not matched or len(vertices) > len(rest):

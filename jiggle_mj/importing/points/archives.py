@@ -10,7 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import BufferedIOBase
+from io import BytesIO
 from lzma import LZMAError
 from pathlib import Path
 
@@ -29,6 +29,7 @@ DAMAGE = (
     ValueError,
     TypeError,
     LookupError,
+    NameError,
     EOFError,
     ArithmeticError,
     MemoryError,
@@ -46,6 +47,8 @@ DAMAGE = (
     Warning,
 )
 """What the readers of numpy, scipy, trimesh and the standard library raise on damaged bytes."""
+HEADER_BYTES = 2**14
+"""Length in which an array's header ends; numpy itself reads no longer ones [bytes]."""
 NUMBER_KINDS = "biuf"
 """Kinds of arrays that hold plain numbers: bool, int, unsigned, float."""
 HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
@@ -122,7 +125,7 @@ def _npz_shapes(path: Path) -> dict[str, tuple[int, ...]]:
         for info in archive.infolist():
             if info.filename.endswith(".npy"):
                 with archive.open(info) as stream:
-                    header = _header(stream)
+                    header = _header(stream.read(HEADER_BYTES))
                 if header is not None:
                     shapes[info.filename.removesuffix(".npy")] = header[0]
     return shapes
@@ -132,21 +135,21 @@ def _read_npz(path: Path, key: str) -> Shaped[np.ndarray, "..."]:
     with zipfile.ZipFile(path) as archive:
         info = archive.getinfo(f"{key}.npy")
         with archive.open(info) as stream:
-            _refuse_large(path, key, stream, info.file_size)
+            _refuse_large(path, key, stream.read(HEADER_BYTES), info.file_size)
         with archive.open(info) as stream:
             return npy_format.read_array(stream, allow_pickle=False)
 
 
 def _read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     with path.open("rb") as stream:
-        _refuse_large(path, "the array", stream, path.stat().st_size)
+        _refuse_large(path, "the array", stream.read(HEADER_BYTES), path.stat().st_size)
         stream.seek(0)
         return npy_format.read_array(stream, allow_pickle=False)
 
 
-def _refuse_large(path: Path, name: str, stream: BufferedIOBase, n_bytes: int) -> None:
+def _refuse_large(path: Path, name: str, head: bytes, n_bytes: int) -> None:
     """Refuse an array whose header declares no plain numbers, too many, or another number than the file holds."""
-    header = _header(stream)
+    header = _header(head)
     if header is None:
         raise RecordingError(f"{path}: {name} holds no plain numbers; objects are never read.")
     shape, dtype = header
@@ -162,8 +165,9 @@ def _refuse_large(path: Path, name: str, stream: BufferedIOBase, n_bytes: int) -
         raise RecordingError(f"{path}: {name} has shape {shape}, but the file ends before that.")
 
 
-def _header(stream: BufferedIOBase) -> tuple[tuple[int, ...], np.dtype] | None:
-    """Return shape and type of the array in a stream; None where it holds no plain numbers."""
+def _header(head: bytes) -> tuple[tuple[int, ...], np.dtype] | None:
+    """Return shape and type of the array that begins with these bytes; None where it holds no plain numbers."""
+    stream = BytesIO(head)
     try:
         reader = HEADERS.get(npy_format.read_magic(stream))
         if reader is None:

@@ -120,7 +120,8 @@ def _displacements(
 ) -> Float[np.ndarray, "t n c"] | None:
     if points.displacements is None:
         return None
-    key = points.displacements if len(points.displacements) > 1 else str(points.displacements[0])
+    given = points.displacements
+    key = str(given[0]) if len(given) == 1 else given
     array = frames_first(
         _components(path, key, points), points.layout or FRAMES_FIRST, name=f"{path}: displacements", n_times=None
     )

@@ -52,17 +52,20 @@ def read_ply(path: Path) -> MeshFile:
 
 
 def _check_ply_header(path: Path) -> None:
-    """Refuse a header that declares more elements than the file has bytes, or none that is complete."""
-    size = path.stat().st_size
-    with path.open("rb") as stream:
-        head = stream.read(MAX_PLY_HEADER_BYTES)
-    header, end, _ = head.partition(b"end_header")
-    if not end:
+    """Refuse a header that does not end, or declares more elements than the file has bytes, or other than its lines."""
+    data = path.read_bytes()
+    size, end = len(data), data.find(b"end_header", 0, MAX_PLY_HEADER_BYTES)
+    if end < 0:
         raise ValueError("its header does not end")
+    header, declared = data[:end], 0
     for line in header.decode("ascii", "replace").splitlines():
         words = line.split()
         if words[:1] == ["element"] and not 0 <= int(words[2]) <= size:
             raise ValueError(f"it declares {quoted(words[2])} elements {quoted(words[1])} in {size} bytes")
+        declared += int(words[2]) if words[:1] == ["element"] else 0
+    lines = sum(1 for line in data[end:].splitlines()[1:] if line.strip()) if b"format ascii" in header else declared
+    if lines != declared:
+        raise ValueError(f"its header declares {declared} lines of elements, and {lines} follow")
 
 
 def read_obj(path: Path) -> MeshFile:

@@ -46,7 +46,8 @@ class MissingRule:
         """Return which positions are at the rule's place, to the rounding of a file."""
         if self.place is None:
             return np.zeros(positions.shape[:2], bool)
-        return np.isclose(positions, self.place, rtol=FLOAT32_ROUNDING, atol=0.0).all(axis=2)
+        place = np.array(self.place)
+        return np.asarray(np.all(np.abs(positions - place) <= FLOAT32_ROUNDING * np.abs(place), axis=2))
 
     def unseen_by_value(self, values: Float[np.ndarray, "t n"]) -> Bool[np.ndarray, "t n"]:
         """Return where the values of the rule's column compare as the rule says."""

@@ -100,10 +100,11 @@ class MarkCheck:
             rows = _shared_place(frame)
             if len(rows):
                 self._refuse(number, frame[rows[0]], rows, "two points cannot be at one place")
-        marked = np.isin(positions, MARK_VALUES).all(axis=2)
+        marked = np.asarray(np.all(np.isin(positions, MARK_VALUES), axis=2))
         partly = marked & ~marked.all(axis=0)
         jumped = partly & (_jump(positions) > _extent(positions))
-        at_origin = partly & (positions == 0).all(axis=2) & ~marked[0]
+        zero = (positions == 0).all(axis=2)
+        at_origin = partly & zero & ~marked[0]
         frames, points = np.nonzero(jumped | at_origin)
         if len(frames):
             rows = points[frames == frames[0]]
