@@ -127,6 +127,12 @@ def _refuse_far(
     Raises:
         RecordingError: the median edge is a large share of the sheet.
     """
+    if len(faces) and faces.max() == len(rest) and faces.min() > 0:
+        raise RecordingError(
+            f"[mesh] faces '{given.faces}' number the vertices up to {faces.max() + given.first_vertex}, with "
+            f"{len(rest)} points: they probably count from {given.first_vertex + 1}; give first_vertex = "
+            f"{given.first_vertex + 1} in [mesh]."
+        )
     if len(rest) < FAR_EDGE_POINTS or not len(faces) or faces.min() < 0 or faces.max() >= len(rest):
         return faces
     finite = rest[np.isfinite(rest).all(axis=1)]

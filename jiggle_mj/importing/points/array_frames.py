@@ -46,7 +46,7 @@ def read_array_frames(paths: list[Path], points: PointFiles) -> Measured:
     seen = None
     swapped = points.layout is not None and points.layout.index("points") < points.layout.index("frames")
     if points.visibility is None and (points.missing is None or points.missing.column not in others):
-        _refuse_unused_visibility(path, others, shape)
+        _refuse_unused_visibility(path, points, others, shape)
     elif points.visibility not in (None, NONE):
         key, negated = split_negation(points.visibility)
         seen, how = read_visibility(
@@ -70,20 +70,23 @@ def read_array_frames(paths: list[Path], points: PointFiles) -> Measured:
     )
 
 
-def _refuse_unused_visibility(path: Path, shapes: dict[str, tuple[int, ...]], shape: tuple[int, ...]) -> None:
+def _refuse_unused_visibility(
+    path: Path, points: PointFiles, shapes: dict[str, tuple[int, ...]], shape: tuple[int, ...]
+) -> None:
     """Refuse an archive with an array that seems to say which points are seen, and marks some as unseen.
 
     Raises:
-        RecordingError: an array with such a name has one value for each frame and point, and not all mean seen.
+        RecordingError: an array of truth values, or with such a name, has one value for each frame and point,
+            and not all mean seen.
     """
     wanted = tuple(length for length in shape if length != 1)
     for key, given in shapes.items():
         sizes = tuple(length for length in given if length != 1)
-        if VISIBILITY_NAME.search(key) and sizes in (wanted, wanted[::-1]):
-            negated = HIDDEN_NAME.search(key) is not None
-            values = read_array(path, key)
-            if (values == (0 if negated else 1)).all():
-                continue
+        if sizes not in (wanted, wanted[::-1]) or len(sizes) < 2:
+            continue
+        negated, values = HIDDEN_NAME.search(key) is not None, read_array(path, key)
+        unseen = (values >= points.visibility_threshold) if negated else (values < points.visibility_threshold)
+        if (values.dtype.kind == "b" or VISIBILITY_NAME.search(key)) and unseen.any():
             raise RecordingError(
                 f"{path} has an array {quoted(key)} {given}, which seems to say which points are seen, and not all are"
                 f': give visibility = "{"not " * negated}{quoted(key)}" in [points], or visibility = "none".'

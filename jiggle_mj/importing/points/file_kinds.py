@@ -43,6 +43,11 @@ FOREIGN_MAGIC = (
     (b"%PDF", "a PDF"),
 )
 """First bytes of kinds that are named when they are refused."""
+FOREIGN_SUFFIXES = frozenset(
+    ".stl .off .gltf .glb .vtk .vtp .vtu .las .laz .e57 .c3d .h5 .hdf5 .pkl .pickle .json .yaml .toml .parquet "
+    ".feather .bag .mcap .db3 .png .jpg .tif .tiff .mp4 .avi .zip .gz .xls .doc .html .xml".split()
+)
+"""Names of files that hold no table of points, or not in a form that is read."""
 OBJ_VERTEX = re.compile(rb"^v[ \t]+[-+.\d]", re.MULTILINE)
 """A line that only an OBJ has."""
 
@@ -94,12 +99,14 @@ def file_kind(path: Path) -> FileKind:
 
 def _kind_by_name(path: Path, head: bytes) -> FileKind:
     suffix = path.suffix.lower()
-    if head.startswith(b"PK"):
+    if head.startswith(b"PK") and suffix != ".zip":
         if suffix in (".xlsx", ".ods", ".xlsm", ".docx"):
             raise RecordingError(f"{path} is an Office file: save the sheet as CSV.")
         return "npz"
     if suffix in (".npz", ".npy", ".mat", ".ply"):
         raise RecordingError(f"{path} cannot be read as {suffix}: it does not begin as one; {SAVE_AS}.")
+    if suffix in FOREIGN_SUFFIXES:
+        raise RecordingError(f"{path} is named {suffix}, which is not read as points; {SAVE_AS}.")
     if suffix == ".pcd":
         return "pcd"
     return "obj" if suffix == ".obj" or OBJ_VERTEX.search(head) else "text"

@@ -30,12 +30,28 @@ def frame_files(folder: DataFolder, patterns: Sequence[str]) -> tuple[list[Path]
         _refuse_unequal_fractions(ordered, pattern)
         if ordered != found:
             before, after = next((a, b) for a, b in pairwise(ordered) if found.index(a) > found.index(b))
-            notes.append(f"frames are in the order of their numbers: {before.name} before {after.name}")
+            notes.append(f"frames are in the order of their numbers: {_shown(before, after)}")
         paths += ordered
+    if len(paths) == len(patterns):
+        swapped = next(((a, b) for a, b in pairwise(paths) if _are_out_of_order(a, b)), None)
+        notes += [f"the order of [points] files is kept: {_shown(*swapped)}"] if swapped else []
     twice = next((path for path in paths if paths.count(path) > 1), None) if len(set(paths)) < len(paths) else None
     if twice is not None:
         raise RecordingError(f"[points] files names {twice.name} twice; each file is one frame.")
     return paths, notes
+
+
+def _shown(before: Path, after: Path) -> str:
+    """Return the order of two files in words, with their folders where they have one name."""
+    if before.name == after.name:
+        return f"{before.parent.name}/{before.name} before {after.parent.name}/{after.name}"
+    return f"{before.name} before {after.name}"
+
+
+def _are_out_of_order(before: Path, after: Path) -> bool:
+    """Return whether two files that differ by numbers alone are in another order than their numbers."""
+    same = DIGITS.sub("", str(before)) == DIGITS.sub("", str(after))
+    return same and _natural(_stem(before)) > _natural(_stem(after))
 
 
 def _stem(path: Path) -> str:

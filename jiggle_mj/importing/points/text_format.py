@@ -53,6 +53,8 @@ class Sample:
     """The format."""
     names: list[str]
     """Headings of the columns; empty where there are none that fit."""
+    commented: bool = False
+    """Whether the headings are those of a comment, which need not be a heading."""
     first: int
     """Position of the first row of numbers among the file's lines."""
     rows: list[list[str]]
@@ -82,12 +84,18 @@ def take_sample(text: TextLines, fmt: TextFormat) -> Sample:
                 f"{text.path} line {line} holds text that is not a number ('{quoted(content)}'), below a heading."
             )
         if len(row) == width and not names:
+            if len(set(row)) == 1:  # headings differ: this is a row, with a word for a lost point that is not known
+                raise RecordingError(
+                    f"{text.path} line {text.lines[number][0]} holds text that is not a number ('{quoted(row[0])}')."
+                )
             names = row
         elif len(row) == width - 1 and number == first - 1 and not names:
             names = _shorter_heading(row, cells[first:])
-    if not names and text.last_comment is not None and len(fmt.split(text.last_comment)) == width:
-        names = fmt.split(text.last_comment)
-    return Sample(format=fmt, names=names, first=first, rows=cells[first:])
+    comment = fmt.split(text.last_comment) if not names and text.last_comment is not None else []
+    commented = len(comment) == width and not any(is_number(cell, fmt.decimal) for cell in comment)
+    return Sample(
+        format=fmt, names=comment if commented else names, commented=commented, first=first, rows=cells[first:]
+    )
 
 
 def find_format(

@@ -74,7 +74,8 @@ def _read(
 ) -> Float[np.ndarray, "n c"]:
     """Return the wanted columns of one file; a heading must be that of the first file."""
     table = first if number == 0 else _open(path, points, first.sample.format)
-    if table.sample.names != first.sample.names:
+    by_comment = table.sample.commented and first.sample.commented
+    if table.sample.names != first.sample.names and not by_comment:
         raise RecordingError(
             f"{path} has the heading '{quoted(', '.join(table.sample.names)) or 'none'}', {first.text.path.name} has "
             f"'{quoted(', '.join(first.sample.names)) or 'none'}': the columns of all frames must be the same."
@@ -124,11 +125,16 @@ def _rule_column(
 
 def _unused_displacements(table: TextTable, columns: list[Column]) -> tuple[str, ...]:
     plain = [plain_heading(name) for name in table.sample.names]
+    axes = AXES[: len(columns)]
+    named = [
+        [name for name in table.sample.names if "disp" in name.lower() and plain_heading(name).endswith(axis)]
+        for axis in axes
+    ]
     for headings in DISPLACEMENT_HEADINGS:
         wanted = [plain_heading(heading) for heading in headings[: len(columns)]]
         if all(plain.count(name) == 1 for name in wanted):
             return tuple(table.sample.names[plain.index(name)] for name in wanted)
-    return ()
+    return tuple(names[0] for names in named) if all(len(names) == 1 for names in named) else ()
 
 
 def _refuse_row_numbers(first_column: Float[np.ndarray, " n"], table: TextTable) -> None:

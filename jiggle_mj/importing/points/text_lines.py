@@ -9,8 +9,8 @@ from ...errors import RecordingError
 from ..data_folder import quoted
 from .cells import UNSEEN_WORDS
 
-MAX_TEXT_BYTES = 10**8
-"""Size above which a text file is refused [bytes]: three million points, whose cells take ten times that in memory."""
+MAX_TEXT_BYTES = 3 * 10**7
+"""Size above which a text file is refused [bytes]: a million points, read in some seconds."""
 MAX_LINE_CHARACTERS = 10**5
 """Length above which a line is no row of a table."""
 BOMS = (
@@ -25,6 +25,8 @@ LINE_END = re.compile(r"\r\n|\r|\n")
 """Line ends of Windows, old Macs and Unix."""
 COMMENT = re.compile(r"#|%|//|\*\*\*(?=\s|$)")
 """Beginning of a comment; DICe writes asterisks."""
+EXCEL_SEPARATOR = re.compile(r'"?sep=.\s*"?', re.IGNORECASE)
+"""A first line that tells Excel the separator, which is found here."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +59,7 @@ def read_lines(path: Path) -> TextLines:
         sign = COMMENT.match(stripped.lstrip())
         if sign and not _is_unseen_word(stripped):
             comment = stripped.lstrip()[sign.end() :].strip() if not lines else comment
-        elif stripped.strip():
+        elif stripped.strip() and not (number == 1 and EXCEL_SEPARATOR.fullmatch(stripped)):
             lines.append((number, stripped))
     return TextLines(path=path, lines=lines, last_comment=comment)
 

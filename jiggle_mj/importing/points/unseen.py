@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from ...errors import RecordingError
 from ..data_folder import quoted
 
-VISIBILITY_NAME = re.compile(r"vis|occlu|valid|lost", re.IGNORECASE)
+VISIBILITY_NAME = re.compile(r"vis|occlu|valid|lost|mask|status|conf|score|prob", re.IGNORECASE)
 """Names that trackers give to arrays of which points are seen."""
 NEGATED = re.compile(r"not\s+(.+)")
 """A visibility that is the opposite of an array."""

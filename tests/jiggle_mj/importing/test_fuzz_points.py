@@ -45,7 +45,7 @@ SEEDS = {
     "frames.mat": (written(savemat, {"p": FRAMES}), 'key = "p"'),
     "text.ply": (MESH.export(file_type="ply", encoding="ascii"), ""),
     "binary.ply": (MESH.export(file_type="ply"), ""),
-    "mesh.obj": (MESH.export(file_type="obj").encode(), ""),
+    "mesh.obj": (str(MESH.export(file_type="obj")).encode(), ""),
     "cloud.pcd": (PCD + POINTS.tobytes(), ""),
 }
 """A small valid file of each kind, and the keys by which it is read."""

@@ -105,6 +105,13 @@ def test_a_visibility_that_nobody_names_is_refused(tmp_path):
         read(archive(tmp_path, 'key = "p"', occluded=lost()))
 
 
+def test_a_visibility_of_which_all_is_seen_needs_no_key(tmp_path):
+    same(
+        read(archive(tmp_path, 'key = "p"', visible=np.ones(SHAPE, bool), conf=np.full(SHAPE, 0.9))),
+        np.zeros(SHAPE, bool),
+    )
+
+
 @pytest.mark.parametrize(
     ("visibility", "message"),
     [
@@ -156,6 +163,21 @@ def test_displacements_are_added_to_reference_positions(tmp_path):
     with pytest.raises(RecordingError, match=r'nothing moves in 3 frames.*displacements = \["U", "V", "W"\]'):
         read(dic(tmp_path / "asked", "X,Y,Z,U,V,W", values, keys))
     same(read(dic(tmp_path, "X,Y,Z,U,V,W", values, f'{keys}displacements = ["U", "V", "W"]')), np.zeros(SHAPE, bool))
+
+
+@pytest.mark.parametrize("heading", ["x,y,z,dx,dy,dz", "x,y,z,Displacement X [mm],Displacement Y [mm],Displacement Z"])
+def test_displacements_are_noticed_by_other_headings(tmp_path, heading):
+    values = np.concatenate([REFERENCE, sheet() - REFERENCE], axis=2)
+    with pytest.raises(RecordingError, match=r"nothing moves in 3 frames.*displacements = \["):
+        read(dic(tmp_path, heading, values, ""))
+
+
+def test_comments_that_differ_are_no_headings(tmp_path):
+    """Each frame begins with its time, in as many words as there are columns."""
+    where = dic(tmp_path, "", sheet(), "")
+    for number, name in enumerate(("rest", "pulled_1", "pulled_2")):
+        np.savetxt(where / f"{name}.xyz", sheet()[number], header=f"frame at {number}s")
+    same(read(where), np.zeros(SHAPE, bool))
 
 
 def test_displacements_that_count_twice_are_refused(tmp_path):

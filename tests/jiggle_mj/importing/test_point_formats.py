@@ -35,7 +35,9 @@ def pcd(points: np.ndarray, kind: str) -> bytes:
 
 def ply(points: np.ndarray, encoding: str) -> bytes:
     mesh = trimesh.Trimesh(points, GRID_FACES, process=False)
-    return mesh.export(file_type="ply", encoding=encoding)
+    exported = mesh.export(file_type="ply", encoding=encoding)
+    assert isinstance(exported, bytes)
+    return exported
 
 
 def obj(points: np.ndarray) -> bytes:
@@ -115,6 +117,13 @@ def test_faces_that_join_distant_points_are_refused(tmp_path):
         bring_in(where)
 
 
+def test_faces_that_count_from_one_are_asked_for(tmp_path):
+    where = folder(tmp_path, toml=TOML.replace("[grasp]", '[mesh]\nfaces = "faces.txt"\n[grasp]'))
+    np.savetxt(where / "faces.txt", np.array(GRID_FACES) + 1, fmt="%d")
+    with pytest.raises(RecordingError, match="probably count from 1; give first_vertex = 1"):
+        bring_in(where)
+
+
 @pytest.mark.parametrize(
     ("names", "note"),
     [
@@ -130,6 +139,13 @@ def test_frame_files_are_in_the_order_of_their_numbers(tmp_path, names, note):
     summary, recording = bring_in(where)
     assert [observation.points.positions[5, 2] for observation in recording] == [5.125e-3, 5.125e-3, 5.625e-3]
     assert summary.notes == note
+
+
+def test_a_list_in_the_order_of_names_is_kept_and_said(tmp_path):
+    where = folder(tmp_path, toml=TOML.replace(FILES, 'files = ["f_1.xyz", "f_10.xyz", "f_2.xyz"]'))
+    for name, points in zip((1, 2, 10), frames(), strict=True):
+        np.savetxt(where / f"f_{name}.xyz", points)
+    assert bring_in(where)[0].notes == ("the order of [points] files is kept: f_10.xyz before f_2.xyz",)
 
 
 def test_times_of_several_lengths_in_names_are_asked_for(tmp_path):
@@ -150,6 +166,7 @@ def test_times_of_several_lengths_in_names_are_asked_for(tmp_path):
         ('["packed.pcd"]', "write it as ascii or binary"),
         ('["bad.ply"]', r"cannot be read as \.ply: it declares 99999999999 elements"),
         ('["book.xlsx"]', "Office file"),
+        ('["mesh.stl"]', "is named .stl, which is not read"),
         ('["d.npy"]\ncolumns = [0, 1, 2]', "are for text files"),
     ],
 )
@@ -160,6 +177,7 @@ def test_what_is_no_file_of_points_is_refused(tmp_path, files, message):
     (where / "short.pcd").write_bytes(pcd(grid(), "binary")[:-5])
     (where / "packed.pcd").write_bytes(pcd(grid(), "binary_compressed"))
     (where / "bad.ply").write_bytes(ply(grid(), "ascii").replace(b"vertex 12", b"vertex 99999999999"))
+    (where / "mesh.stl").write_bytes(bytes(84))
     (where / "book.xlsx").write_bytes(b"PK\x03\x04")
     with pytest.raises(RecordingError, match=message):
         bring_in(where)

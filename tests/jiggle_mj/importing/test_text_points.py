@@ -46,6 +46,8 @@ def first_frame(tmp_path, content: str | bytes, keys: str = "") -> np.ndarray:
         table(" ", heading="# x y z\n% second\n// third\n*** DICe"),
         table(",", heading='"x","y","z"').replace("0.125", '"0.125"'),
         table(",", end=",\n", heading="x,y,z"),
+        table(";", ",", heading="sep=;\nx;y;z"),
+        table('";"', ",").replace("\n", '"\n"').join('""').removesuffix('"\n""') + '"',
         table(" ").replace("0.125", "1.25D-1").replace("2.125", "0.2125d+01"),
         codecs.BOM_UTF8 + table(",").encode(),
         table(",").encode("utf-16"),
@@ -115,6 +117,7 @@ def test_what_can_be_read_in_two_ways_is_asked_for(tmp_path, content, keys, expe
     [
         (table(" ").replace("0.125", "0.125 7", 1), "line 2 has 3 columns, line 1 has 4"),
         ("0.0 0.0 oops\n" + table(" "), "line 1 holds text that is not a number"),
+        ("lost,lost,lost\n" + table(","), r"line 1 holds text that is not a number \('lost'\)"),
         ("x,y,z\noops,oops,oops\n" + table(","), "line 2 holds text that is not a number .*below a heading"),
         (table(" ").replace("2.125", "2_1.25"), "holds text that is not a number"),
         (table(",").replace("2.125", "1.002,125"), r"line 2 has 4 columns|holds text"),
