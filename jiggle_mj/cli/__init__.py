@@ -11,6 +11,7 @@ from ..errors import JiggleError, OptionError, OutputError, SceneError
 from .checks import bench, doctor, scene_check
 from .estimating import close_loop, estimate, identify, run, score
 from .importing import import_, inspect
+from .init import init
 from .recording import record
 from .tables import table
 from .terminal import FAILED, INTERRUPTED, WRONG_USAGE, stop
@@ -18,6 +19,7 @@ from .terminal import FAILED, INTERRUPTED, WRONG_USAGE, stop
 VERBS = {
     "run": run,
     "record": record,
+    "init": init,
     "import": import_,
     "inspect": inspect,
     "estimate": estimate,

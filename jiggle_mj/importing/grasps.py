@@ -159,7 +159,7 @@ def _held(
             )
     if not np.isfinite(frames[0][held]).all(axis=1).any():
         raise RecordingError(
-            f"{table.where}: the rest frame {names[0]} shows none of the {len(held)} grasped points, so the tool's "
-            "first position is unknown; choose another rest, or give the path in [grasp]."
+            f"{table.where}: the rest frame {names[0]} shows none of the {len(held)} grasped points, so the first "
+            "position of the tool is unknown; choose another rest, or give the path in [grasp]."
         )
     return held

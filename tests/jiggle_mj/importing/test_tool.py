@@ -60,7 +60,7 @@ attached_rows = []
 
 
 def reported_folder(tmp_path: Path, *, toml: str = REPORTED, **arrays) -> Path:
-    """Two runs of three frames at 2 Hz; points and tool move along x at 10 mm/s, it rotates about z at 0.1 rad/s."""
+    """Two runs of three frames at 2 Hz; points and tool move along x at 10 mm/s, it turns about z at 0.1 rad/s."""
     where = tmp_path / "data"
     where.mkdir()
     at = np.arange(0, 4.01, 0.2)

@@ -1,0 +1,139 @@
+"""Guess which files of a folder hold the tracked points, and how they are read."""
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import RecordingError
+from .data_folder import DataFolder, quoted
+from .point_files import read_frames
+from .points.archives import array_shapes
+from .points.dic_formats import DIC_FORMATS
+from .points.points_table import PointFiles
+from .units import LENGTH_UNITS
+
+ARCHIVES, FRAMES = (".npz", ".mat"), (".csv", ".txt", ".tsv", ".xyz", ".dat", ".ply", ".obj", ".pcd", ".asc", ".pts")
+"""Endings of files that hold all frames, and of files that hold one each."""
+MAX_FILES = 20_000
+"""Files of a folder that are looked at."""
+VISIBILITY = re.compile(r"visib|valid|occlu", re.IGNORECASE)
+"""Names of arrays that say which points are seen."""
+UNIT_SUFFIX = re.compile(r"_(um|mm|cm|m)$")
+"""End of an array's name that states its unit of length."""
+LIKELY_EXTENT = (0.01, 0.5)
+"""Extent of a sheet of tissue or cloth, by which the unit is guessed [m]."""
+PREFERRED_UNITS = ("m", "mm", "cm", "um")
+"""Units in the order in which they are tried: cm are rare in exports."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuessedPoints:
+    """The files of the points, and what they hold."""
+
+    files: PointFiles
+    """What `[points]` must say."""
+    positions: Float[np.ndarray, "t n 3"]
+    """All frames in the unit of the data."""
+    arrays: dict[str, tuple[int, ...]]
+    """Name and shape of each array of the archive; empty for files of one frame each."""
+    notes: list[str]
+    """What the reader assumed or found, a line each."""
+    layout: str | None = None
+    """The stated layout, as text."""
+
+
+def guess_points(folder: Path) -> GuessedPoints:
+    """Return the likeliest points of a folder.
+
+    Raises:
+        RecordingError: the folder cannot be read, or no file in it holds points of two frames.
+    """
+    try:
+        names = sorted(path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    except (OSError, ValueError) as failure:
+        raise RecordingError(f"{quoted(folder)} is no folder that can be read: {quoted(failure)}.") from failure
+    if len(names) > MAX_FILES:
+        raise RecordingError(f"{folder} holds {len(names)} files; at most {MAX_FILES} are looked at.")
+    failures: list[str] = []
+    for files in (*_of_archives(folder, names, failures), *_of_frames(names)):
+        found = _first_readable(folder, files, failures)
+        if found is not None:
+            return found
+    why = f" {failures[0]}" if failures else " None is of a known kind with at least two frames."
+    raise RecordingError(
+        f"{folder} holds no points that could be read without help: {len(names)} files.{why} Write {folder}/"
+        "recording.toml by hand: docs/RECORDINGS.md has its keys."
+    )
+
+
+def guess_unit(points: GuessedPoints) -> tuple[str, str]:
+    """Return the unit of the data, and why: the name of the array states it, or the extent of the sheet fits it."""
+    key = points.files.key
+    stated = UNIT_SUFFIX.search(key) if isinstance(key, str) else None
+    extent = float(np.nanmax(np.ptp(_finite(points.positions[0]), axis=0)))
+    if stated is not None:
+        return stated[1], f"as the name {key} says; the sheet is {extent * LENGTH_UNITS[stated[1]]:.3g} m large"
+    low, high = LIKELY_EXTENT
+    for unit in PREFERRED_UNITS:
+        if low <= extent * LENGTH_UNITS[unit] <= high:
+            return unit, f"guessed: the sheet is then {extent * LENGTH_UNITS[unit]:.3g} m large"
+    return "m", f"not known: the sheet is {extent:.3g} units large, which fits none of {', '.join(PREFERRED_UNITS)}"
+
+
+def _finite(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def _of_archives(folder: Path, names: list[str], failures: list[str]) -> list[PointFiles]:
+    """Return candidates among the arrays of archives, and single arrays, the largest first."""
+    sized: list[tuple[int, PointFiles]] = []
+    for name in names:
+        suffix = Path(name).suffix.lower()
+        if suffix == ".npy":
+            sized.append(((folder / name).stat().st_size, PointFiles(files=(name,))))
+        if suffix not in ARCHIVES:
+            continue
+        try:
+            shapes = array_shapes(folder / name)
+        except RecordingError as failure:
+            failures.append(str(failure))
+            continue
+        for key, shape in shapes.items():
+            if len([length for length in shape if length > 1]) == 3 and 2 <= shape[-1] <= 3:
+                pixels = re.search(r"px|pixel|uv|image", key, re.IGNORECASE) is not None
+                sized.append((0 if pixels else int(np.prod(shape)), PointFiles(files=(name,), key=key)))
+    return [files for _, files in sorted(sized, key=lambda item: -item[0])]
+
+
+def _of_frames(names: list[str]) -> list[PointFiles]:
+    """Return candidates of files of one frame each: names that differ in their numbers alone, the most files first."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        if Path(name).suffix.lower() in FRAMES:
+            groups.setdefault(re.sub(r"\d+", "*", name), []).append(name)
+    ordered = sorted(groups.items(), key=lambda item: -len(item[1]))
+    return [PointFiles(files=(pattern,)) for pattern, members in ordered if len(members) >= 2 and "[" not in pattern]
+
+
+def _first_readable(folder: Path, files: PointFiles, failures: list[str]) -> GuessedPoints | None:
+    """Return the points under the first way of reading that works: as they are, as an export, points first."""
+    shapes = array_shapes(folder / files.files[0]) if files.key is not None else {}
+    ways: list[tuple[PointFiles, str | None]] = [(files, None)]
+    if files.key is None:
+        ways += [(replace(files, format=name), None) for name in DIC_FORMATS]
+    visible = next((key for key in shapes if VISIBILITY.search(key)), None)
+    ways += [(replace(files, layout=("points", "frames", "xyz")), "points, frames")] if shapes else []
+    if visible is not None:
+        ways += [(replace(way, visibility=visible), layout) for way, layout in ways]
+    for way, layout in ways:
+        try:
+            found = read_frames(DataFolder(path=folder), way)
+        except RecordingError as failure:
+            failures.append(str(failure))
+            continue
+        if len(found.positions) >= 2 and len(_finite(found.positions[0])) >= 3:
+            return GuessedPoints(files=way, positions=found.positions, arrays=shapes, notes=found.notes, layout=layout)
+    return None
