@@ -138,7 +138,7 @@ def import_folder(
         n_held=n_held,
         n_attached=None if truth is None else int(truth.attached.sum()),
         skipped=tuple(skipped),
-        notes=(*found.notes, *clock.notes),
+        notes=(*found.notes, *clock.notes, *tool.notes),
     )
 
 

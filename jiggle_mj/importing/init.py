@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from ..errors import JiggleError, OutputError, RecordingError
 from .data_folder import DataFolder
 from .folder import import_folder
-from .grasp_table import Rows
+from .grasp_table import START_TOGETHER, Rows
 from .init_arrays import GuessedArrays, guess_arrays
 from .init_motion import guess_held, guess_noise
 from .init_points import GuessedPoints, guess_points, guess_unit
@@ -163,7 +163,12 @@ def _tool_lines(arrays: GuessedArrays) -> list[str]:
         return ["# without tool, the held points give its position"]
     lines = [f"tool = {_text(arrays.tool)}  # guessed by its name"]
     given = {"tool_times": arrays.tool_times, "tool_turns": arrays.tool_turns, "tool_unit": arrays.tool_unit}
+    given |= {"tool_time_unit": arrays.tool_time_unit}
     lines += [f"{key} = {_text(value)}" for key, value in given.items() if value is not None]
+    if arrays.clocks_apart:
+        lines.append(
+            f"tool_clock_offset = {_text(START_TOGETHER)}  # guessed: the clocks differ; or seconds to add"
+        )
     return [*lines, "after = 0.0  # s from the begin until the jaws close"]
 
 

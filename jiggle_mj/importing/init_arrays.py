@@ -9,6 +9,7 @@ import numpy as np
 from .clock import LIKELY_PERIOD, MAX_PERIOD
 from .init_points import UNIT_SUFFIX, GuessedPoints
 from .points.archives import read_array
+from .reports import MAX_AGE, MAX_OUTSIDE
 from .units import LENGTH_UNITS, TIME_UNITS
 
 TIME = re.compile(r"time|stamp|^ts?$|_t$|^t_|sec", re.IGNORECASE)
@@ -51,6 +52,10 @@ class GuessedArrays:
     """Its orientations."""
     tool_unit: str | None
     """Unit of its positions where the name states one."""
+    tool_time_unit: str | None
+    """Unit of its times where it is not that of the frames."""
+    clocks_apart: bool
+    """Whether the reports, on their own clock, begin after the frames or end before them."""
 
 
 def guess_arrays(folder: Path, points: GuessedPoints) -> GuessedArrays:
@@ -82,6 +87,12 @@ def guess_arrays(folder: Path, points: GuessedPoints) -> GuessedArrays:
         if tool_times is None and n_reports != n_frames:
             tool = tool_turns = None
     time_unit, why = ("s", "") if times is None else _time_unit(times, read_array(archive, times))
+    tool_time_unit, apart = time_unit, False
+    if times is not None and tool_times is not None:
+        frame_times, report_times = read_array(archive, times), read_array(archive, tool_times)
+        stated = TIME_SUFFIX.search(tool_times)
+        tool_time_unit = time_unit if stated is None else stated[1]
+        apart = _apart(frame_times, TIME_UNITS[time_unit], report_times, TIME_UNITS[tool_time_unit])
     suffix = None if tool is None else UNIT_SUFFIX.search(tool)
     return GuessedArrays(
         times=times,
@@ -93,6 +104,8 @@ def guess_arrays(folder: Path, points: GuessedPoints) -> GuessedArrays:
         tool=tool,
         tool_times=tool_times,
         tool_turns=tool_turns,
+        tool_time_unit=None if tool_time_unit == time_unit else tool_time_unit,
+        clocks_apart=apart,
         tool_unit=None if suffix is None or suffix[1] not in LENGTH_UNITS else suffix[1],
     )
 
@@ -114,3 +127,11 @@ def _time_unit(name: str, times: np.ndarray) -> tuple[str, str]:
 
 def _seconds(time: float, unit: str) -> float:
     return time * TIME_UNITS[unit] / TIME_UNITS["s"]
+
+
+def _apart(frames: np.ndarray, frame_unit: int, reports: np.ndarray, report_unit: int) -> bool:
+    """Return whether a tenth of the frames or more lie outside the reports, or the first frame does."""
+    times = frames.astype(np.longdouble) * frame_unit
+    first, last = (np.longdouble(reports[k]) * report_unit for k in (0, -1))
+    outside = (times < first - MAX_AGE) | (times > last + MAX_AGE)
+    return bool(outside[0] or outside.mean() > MAX_OUTSIDE)

@@ -80,6 +80,15 @@ class Tool:
         """Return the number of points that are held at some time."""
         return len(np.unique(np.concatenate([np.empty(0, int), *(grasp.held for grasp in self.grasps)])))
 
+    @property
+    def notes(self) -> list[str]:
+        """Return a line for each grasp that declares no points as held."""
+        return [
+            f"{grasp.what} holds the mesh's vertices within {grasp.given.radius * 1e3:.3g} mm of the tool"
+            for grasp in self.grasps
+            if not len(grasp.held)
+        ]
+
     def why_unknown(self, frame: int, positions: Float[np.ndarray, "n 3"]) -> str | None:
         """Return why the tool's position in a frame is unknown; None where it is known."""
         if self.reports is not None:
