@@ -102,7 +102,7 @@ def write_text(path: Path, text: str) -> None:
     except OSError as failure:
         with suppress(OSError):
             partial.unlink()
-        raise OutputError(f"{path} cannot be written: {failure.strerror}.") from failure
+        raise OutputError(f"{path} cannot be written ({failure.strerror}); give a folder that exists.") from failure
 
 
 def discard(path: Path) -> None:

@@ -147,7 +147,7 @@ def parse_calibration(message: CalibrationMessage, topic: str) -> CameraCalibrat
             f"{topic} holds numbers beyond those of a camera: D up to {MAX_DISTORTION:g}, K and P up to "
             f"{MAX_FOCAL_PX:g} px are read."
         )
-    if not np.allclose(R.reshape(3, 3) @ R.reshape(3, 3).T, np.eye(3), rtol=0, atol=UNIT_LENGTH):
+    if not _is_rotation(R.reshape(3, 3)):
         raise RecordingError(f"{topic} has an R that is no rotation.")
     if not (K[4] > 0 and P[5] > 0 and K[8] == 1 and P[10] == 1):
         raise RecordingError(f"{topic} has no pinhole matrices: K[4], P[5] must be above 0, K[8] and P[10] must be 1.")
@@ -163,6 +163,11 @@ def parse_calibration(message: CalibrationMessage, topic: str) -> CameraCalibrat
         D=D,
         R=R.reshape(3, 3),
     )
+
+
+def _is_rotation(R: Float[np.ndarray, "3 3"]) -> bool:
+    bounded = bool((np.abs(R) <= 1 + UNIT_LENGTH).all())
+    return bounded and np.allclose(R @ R.T, np.eye(3), rtol=0, atol=2 * UNIT_LENGTH) and bool(np.linalg.det(R) > 0)
 
 
 def frame_transform(parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]) -> FrameTransform:

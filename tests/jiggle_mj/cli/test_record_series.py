@@ -8,9 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from jiggle_mj.episode import recording_identity
+from jiggle_mj.recording.declaration import METADATA
 from jiggle_mj.recording.mcap_files import truth_path
+from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.scenes import disturbed, load_scene
+from tests.support.mcap_edits import records_of
 from tests.support.series import (
     SCENE,
     Inside,
@@ -67,10 +71,26 @@ def test_a_secret_is_in_no_recording_and_no_log(tmp_path, monkeypatch, capsys):
     printed = "".join(capsys.readouterr()) + "".join(shown) + str([*out.iterdir()])
     assert len(shown) == 1
     assert "gravity" not in printed.lower() and "disturb" not in printed.lower()
-    recorded = (out / "000000.mcap").read_bytes()
-    assert recorded == (tmp_path / "again" / "000000.mcap").read_bytes() and b"disturb" not in recorded
+    assert b"disturb" not in (out / "000000.mcap").read_bytes()
+    assert "seed" not in Recording.open(out / "000000.mcap").metadata
     details = json.dumps(read_truth(truth_path(out / "000000.mcap")).details)
-    assert '"name": "gravity"' in details
+    assert '"name": "gravity"' in details and '"seed": 0' in details
+
+
+def test_a_secret_scene_recorded_again_differs_in_its_identity_alone(tmp_path):
+    """The salt is random, so that nobody finds the scene by trying out digests; a series knows its own by the truth."""
+    path = write_scene(tmp_path)
+    path.write_text("secret = true\n" + SCENE)
+    scene, identities, rest = load_scene(path), [], []
+    for folder in (tmp_path / "one", tmp_path / "other"):
+        record(scene, folder, Inside(lambda _: None), count=1)
+        assert record(scene, folder, Inside(lambda _: None), count=1).n_kept == 1
+        records = records_of((folder / "000000.mcap").read_bytes())
+        identities += [each.entries.pop("identity") for each in records if each.name == METADATA]
+        rest.append(records)
+        assert read_truth(truth_path(folder / "000000.mcap")).identity == identities[-1]
+    assert rest[0] == rest[1] and identities[0] != identities[1]
+    assert recording_identity(scene, "particles", 0) not in identities
 
 
 def test_ctrl_c_leaves_complete_recordings_and_says_how_to_continue(one_by_one, tmp_path):
