@@ -81,9 +81,7 @@ def triangulate(flat: Float[np.ndarray, "m 2"], longest_edge: float) -> Int[np.n
     try:
         faces = Delaunay(flat).simplices.astype(np.int64)
     except (QhullError, ValueError) as failure:
-        raise MeshError(
-            f"{len(flat)} points cannot be triangulated: they lie on one line, or at one place."
-        ) from failure
+        raise MeshError(f"{len(flat)} points make no sheet: three that are not on one line are needed.") from failure
     corners = flat[faces]
     edges = corners - np.roll(corners, 1, axis=1)
     signed = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]

@@ -9,14 +9,17 @@ from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.recording.estimate import EstimateRecording, read_estimate
 from jiggle_mj.recording.json_values import entry, optional, parse_object
 from jiggle_mj.recording.output_files import write_text
+from jiggle_mj.recording.reader import PAIRING_TOLERANCE_NS
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.toml_kinds import count, counts, flag, integer, number, positive, table, tables, text
 from jiggle_mj.truth import Truth
 
 Json = dict[str, object]
 Kind = Callable[[Any], Any]
-RECORDED, IDENTITY = "recording", "recording.identity"
-"""Metadata of an estimate: name and identity of the recording that was estimated."""
+RECORDED, IDENTITY, TOLERANCE = "recording", "recording.identity", "recording.tolerance_ns"
+"""Metadata of an estimate: name and identity of the recording that was estimated, and the tolerance of its pairs."""
+MAX_DIGITS = 12
+"""Longest tolerance that is read: a thousand seconds in ns."""
 MADE_BY = "'jiggle-mj table' writes it; delete it, and it is made anew"
 """Origin of a file that a study keeps for one of its cells."""
 
@@ -93,6 +96,12 @@ def read_result(path: Path) -> Json:
             f"{failure} It is not a result of this program; give the folder that 'estimate' wrote."
         ) from failure
     return figures
+
+
+def pairing_tolerance(estimated: EstimateRecording) -> int:
+    """Return the tolerance with which an estimate paired the images of its recording [ns]."""
+    given = estimated.metadata.get(TOLERANCE, "")
+    return int(given) if given.isascii() and given.isdigit() and len(given) <= MAX_DIGITS else PAIRING_TOLERANCE_NS
 
 
 def read_json(path: Path, origin: str) -> dict[str, Any]:

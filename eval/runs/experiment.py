@@ -41,7 +41,15 @@ from jiggle_mj.recording.reader import PAIRING_TOLERANCE_NS, Recording
 from jiggle_mj.truth import Truth
 
 from ..metrics.result import Run, result, score_read
-from ..metrics.result_file import IDENTITY, RECORDED, Json, read_scorable, write_result
+from ..metrics.result_file import (
+    IDENTITY,
+    RECORDED,
+    TOLERANCE,
+    Json,
+    pairing_tolerance,
+    read_scorable,
+    write_result,
+)
 from ..report.run_page import shown_steps, write_report
 from .acting import actions, acts, check_policy_fits, policy_named
 
@@ -188,7 +196,7 @@ def run_estimator(
     estimator = Estimator(recording.declaration, recording.camera, config=config, mask=mask, disparity=disparity)
     clear_directory(directory, own)
     name = recording.metadata.get("name", recording_path.stem)
-    about = {RECORDED: name, IDENTITY: recording.metadata.get("identity", "")}
+    about = {RECORDED: name, IDENTITY: recording.metadata.get("identity", ""), TOLERANCE: str(tolerance_ns)}
     episode = estimate(recording, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
     run = Run(
         episode=episode,
@@ -237,7 +245,8 @@ def score_directory(
         recording = next((path for path in candidates if _is_of(estimated, path)), None)
     if recording is None and figures["sensing"] == "stereo":
         log("the recording is not next to the truth: the report has no pictures; pass --recording for them")
-    _report(directory, estimated, figures, recording=recording, truth=opened)
+    tolerance_ns = pairing_tolerance(estimated)
+    _report(directory, estimated, figures, recording=recording, truth=opened, tolerance_ns=tolerance_ns)
     return figures
 
 
@@ -250,7 +259,8 @@ def _ended(policy: Policy | None, *, interrupted: bool) -> str | None:
 
 def _is_of(read: EstimateRecording, recording: Path) -> bool:
     """Say whether an estimate is of this recording, by name and identity."""
-    about = Recording.open(recording, allow_truncated=True).metadata
+    tolerance_ns = pairing_tolerance(read)
+    about = Recording.open(recording, allow_truncated=True, tolerance_ns=tolerance_ns).metadata
     same = about.get("name", recording.stem) == read.metadata.get(RECORDED)
     return same and about.get("identity", "") == read.metadata.get(IDENTITY, "")
 

@@ -166,9 +166,7 @@ def _tool_lines(arrays: GuessedArrays) -> list[str]:
     given |= {"tool_time_unit": arrays.tool_time_unit}
     lines += [f"{key} = {_text(value)}" for key, value in given.items() if value is not None]
     if arrays.clocks_apart:
-        lines.append(
-            f"tool_clock_offset = {_text(START_TOGETHER)}  # guessed: the clocks differ; or seconds to add"
-        )
+        lines.append(f"tool_clock_offset = {_text(START_TOGETHER)}  # guessed: the clocks differ; or seconds to add")
     return [*lines, "after = 0.0  # s from the begin until the jaws close"]
 
 

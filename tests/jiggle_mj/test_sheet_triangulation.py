@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jiggle_mj.errors import MeshError
 from jiggle_mj.sheet_triangulation import SheetPlane, extend, triangulate
 from tests.support.measured_folder import GRID_FACES, grid
 
@@ -29,3 +30,9 @@ def test_extension_on_one_side_leaves_the_other_alone():
     added = extend(flat, begin=-6.0, end=3.0, spacing=2.0)
     assert added[:, 0].max() < 0 and added[:, 0].min() == -6
     assert len(triangulate(np.concatenate([flat, added]), 5.0)) > len(GRID_FACES)
+
+
+@pytest.mark.parametrize("flat", [np.zeros((2, 2)), np.arange(10.0)[:, None] * [1.0, 2.0], np.zeros((5, 2))])
+def test_points_on_a_line_make_no_sheet(flat):
+    with pytest.raises(MeshError, match="make no sheet"):
+        triangulate(flat, 1.0)
