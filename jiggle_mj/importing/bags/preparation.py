@@ -105,7 +105,7 @@ def prepare(
         depth = parse_camera_info(info, roles["depth_info"].topic, survey.frame["depth_info"]).calibration
     if main != "left" and settings.noise_sd is None:
         notes.append(
-            f"noise of the points: {1e3 * MeasuredPoints.sd:g} mm is assumed; give yours as [points] noise_sd in map.toml"
+            f"noise of the points: {1e3 * MeasuredPoints.sd:g} mm is assumed; map.toml has [points] noise_sd for yours"
         )
     frames = _frames(survey, main, settings, notes)
     stamps = [frame.stamp for frame in frames]
