@@ -74,6 +74,7 @@ def npz(member: bytes) -> bytes:
         (npz(header("(2, 12, 3)") + bytes(576))[:-40], r"cannot be read as \.npz"),
         (header("(2, 12, 3)"), "has no array|ends before"),
     ],
+    ids=["terabytes", "digits", "bomb", "short", "objects", "negative", "pickle", "cut-off", "no-archive"],
 )
 def test_what_an_archive_declares_is_checked_before_it_is_read(tmp_path, data, message):
     where = folder(tmp_path, toml=TOML.replace(FILES, 'files = ["d.npz"]\nkey = "p"'))
