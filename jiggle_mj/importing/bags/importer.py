@@ -21,6 +21,7 @@ from ...errors import OutputError, RecordingError
 from ...observation import MeasuredPoints, Observation, StereoPair, ToolState
 from ...recording.declaration import identity
 from ...recording.writer import RecordingWriter
+from ..declaration import DEFAULT_GRASP_RADIUS
 from .bag_file import Bag
 from .camera_order import left_is_left
 from .clouds import cloud_points, depth_points
@@ -121,6 +122,8 @@ def _import(bag: Bag, out: Path, settings: BagSettings) -> BagSummary:
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+    if prepared.settings.grasp_radius is None and all(state.radius is None for state in prepared.jaws):
+        notes.append(f"radius of the grip: {1e3 * DEFAULT_GRASP_RADIUS:g} mm is assumed; say yours with --grasp-radius")
     used = [state for state in prepared.jaws if state.closed]
     if not used:
         notes.append("the jaws never close, so there is nothing to estimate from")
@@ -175,7 +178,7 @@ def _observation(prepared: Preparation, stamp: int, read: dict[Role, Any]) -> Ob
             quat_wxyz=quat_wxyz,
             closed=jaws.closed,
             grasp=jaws.grasp,
-            radius=prepared.settings.grasp_radius if jaws.radius is None else jaws.radius,
+            radius=jaws.radius or prepared.settings.grasp_radius or DEFAULT_GRASP_RADIUS,
             held_tracks=jaws.held_tracks,
             by_points=jaws.by_points,
         ),

@@ -105,7 +105,8 @@ def prepare(
         depth = parse_camera_info(info, roles["depth_info"].topic, survey.frame["depth_info"]).calibration
     if main != "left" and settings.noise_sd is None:
         notes.append(
-            f"noise of the points: {1e3 * MeasuredPoints.sd:g} mm is assumed; map.toml has [points] noise_sd for yours"
+            f"noise of the points: {1e3 * MeasuredPoints.sd:g} mm is assumed; say yours with [points] noise_sd in "
+            "map.toml"
         )
     frames = _frames(survey, main, settings, notes)
     stamps = [frame.stamp for frame in frames]

@@ -14,7 +14,6 @@ from ...errors import OptionError, RecordingError
 from ...observation import Declaration
 from ...toml_kinds import StrictTable
 from ..declaration import parse_declaration_table
-from ..grasp_table import DEFAULT_GRASP_RADIUS
 from .gripper import ClosedRule
 
 Role = Literal["left", "right", "left_info", "right_info", "tool", "gripper", "points", "depth", "depth_info", "force"]
@@ -53,8 +52,8 @@ class BagSettings:
     """Topic of each role that the user names; `tf:FRAME` for a tool that is a frame of /tf; empty for no topic."""
     closed: ClosedRule | None = None
     """When the jaws are closed; None where the messages say so themselves."""
-    grasp_radius: float = DEFAULT_GRASP_RADIUS
-    """Radius of the grip [m]."""
+    grasp_radius: float | None = None
+    """Radius of the grip [m]; None for the importer's default, which is said."""
     camera_info: dict[Side, Path] = field(default_factory=dict)
     """Calibration files of `camera_calibration`, which replace the bag's."""
     rectified: bool | None = None
@@ -97,7 +96,7 @@ def read_map(path: Path) -> BagSettings:
     settings = BagSettings(
         topics={role: topics.take(role, kinds.text) for role in ROLES if role in topics.values},
         closed=None if rule is None else ClosedRule.parse(rule),
-        grasp_radius=gripper.take("radius", kinds.positive, DEFAULT_GRASP_RADIUS),
+        grasp_radius=gripper.take("radius", kinds.positive, None),
         camera_info={
             side: path.parent / camera.take(side, kinds.text) for side in ("left", "right") if side in camera.values
         },

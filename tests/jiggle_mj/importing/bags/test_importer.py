@@ -328,3 +328,12 @@ def test_the_bag_itself_is_never_replaced(tmp_path: Path):
         with pytest.raises(OutputError, match="is the bag, or lies in it"):
             import_bag(path.parent, out, overwrite=True) if out != path else import_bag(path, out, overwrite=True)
     assert path.read_bytes() == before
+
+
+def test_what_is_assumed_is_said(tmp_path: Path):
+    path = small_bag(tmp_path / "bag")
+    assumed, recording = imported(path)
+    assert any("radius of the grip: 2 mm is assumed" in note for note in assumed.notes)
+    assert next(iter(recording)).tool.radius == 0.002
+    given, recording = imported(path, grasp_radius=0.007)
+    assert not any("assumed" in note for note in given.notes) and next(iter(recording)).tool.radius == 0.007
