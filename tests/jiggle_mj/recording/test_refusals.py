@@ -129,7 +129,7 @@ def test_a_ros_schema_is_refused_by_name(tmp_path):
         channel = writer.register_channel(LEFT, "cdr", schema)
         writer.add_message(channel, 0, b"", 0)
         writer.finish()
-    with pytest.raises(RecordingError, match=r"is sensor_msgs/msg/Image \(cdr\); it must be foxglove.CompressedImage"):
+    with pytest.raises(RecordingError, match=r"is a robot.s bag; import it first: jiggle-mj import"):
         Recording.open(path)
 
 
