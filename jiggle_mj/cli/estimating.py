@@ -50,7 +50,7 @@ def run(
     from jiggle_mj.eval.runs.experiment import run_scene
     from jiggle_mj.scenes import disturbed, load_scene
 
-    from ..recording.refusals import refuse_bag
+    from ..recording.bag_refusal import refuse_bag
 
     refuse_bag(Path(scene))
     scene_to_run, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)

@@ -3,14 +3,17 @@
 import json
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import tyro
 from rich.table import Column, Table
 
 from ..errors import OptionError
-from .options import AsJson, Out, PathArgument, Repeated
+from .options import AsJson, Out, PathArgument
 from .terminal import console
 
+Repeated = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")]]
+"""An option that may be repeated."""
 SHOWN_REASONS = 8
 """Reasons for leaving out frames that are printed."""
 

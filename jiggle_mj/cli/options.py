@@ -15,7 +15,6 @@ AsJson = Annotated[bool, tyro.conf.arg(name="json")]
 PairingTolerance = Annotated[float, tyro.conf.arg(name="pairing-tolerance", metavar="MS")]
 """Largest difference between the stamps of one frame [ms]."""
 Disturb = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[=MAGNITUDE]")]]
-Repeated = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")]]
 PAIRING_TOLERANCE_MS = 5.0
 """Default of `PairingTolerance`; the sensors of a robot stamp the same instant a few ms apart."""
 MAX_PAIRING_TOLERANCE_MS = 1000.0

@@ -20,13 +20,14 @@ from ..actions import Cut, Suture
 from ..errors import RecordingError
 from ..observation import Declaration
 from ..toml_kinds import MAX_SHOWN
+from .bag_refusal import refuse_bag
 from .declaration import DECLARATION, DECLARED_MESH, METADATA, parse_declaration, with_mesh
 from .events import parse_event
 from .frames import FrameTree
 from .mcap_files import iterate_records
 from .messages import checked_stamp, parse_message
 from .pairing import Stamped
-from .refusals import refuse_bag, refuse_incomplete, refuse_truth
+from .refusals import refuse_incomplete, refuse_truth
 from .schemas import parse_grasp, stamp_of
 from .topics import EVENT, GRASP, JSON_TOPICS, LEFT, POINTS, POSE, RIGHT, SCHEMAS
 

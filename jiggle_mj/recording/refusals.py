@@ -1,4 +1,4 @@
-"""What is refused as a recording: a robot's bag, a file that holds truth, one that lacks what an estimate needs."""
+"""What is refused as a recording: a file that holds truth, and one that lacks what an estimate needs."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -8,27 +8,6 @@ from .topics import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO
 
 MAX_LISTED = 500
 """Most characters of topics that a message lists: those of a robot, shortened only where a name is absurd."""
-BAG_SUFFIXES = (".bag", ".db3")
-"""Suffixes of files that only a robot's bag has."""
-BAG_ENCODINGS = ("cdr", "ros1")
-"""Encodings of the messages of ROS 2 and ROS 1."""
-
-
-def refuse_bag(path: Path, encoding: str = "") -> None:
-    """Refuse a robot's bag, which must be imported first.
-
-    Args:
-        path: the file or folder.
-        encoding: of the messages on one of its topics, where that is known.
-
-    Raises:
-        RecordingError: it is a bag; the message gives the command.
-    """
-    is_folder = path.is_dir() and ((path / "metadata.yaml").exists() or any(path.glob("*.db3")))
-    if is_folder or (path.suffix in BAG_SUFFIXES and path.exists()) or encoding in BAG_ENCODINGS:
-        raise RecordingError(
-            f"{path} is a robot's bag; import it first: jiggle-mj import {path} --out run.mcap (docs/BAGS.md)."
-        )
 
 
 def refuse_truth(path: Path, topic: str) -> None:

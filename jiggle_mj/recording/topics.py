@@ -14,8 +14,6 @@ LEFT, RIGHT = "/camera/left/image_raw", "/camera/right/image_raw"
 LEFT_INFO, RIGHT_INFO = "/camera/left/camera_info", "/camera/right/camera_info"
 TF, TF_STATIC = "/tf", "/tf_static"
 POSE, GRASP, POINTS, EVENT = "/tool/pose", "/tool/grasp", "/tissue/points", "/event/topology"
-FORCE = "/tool/force"
-"""Topic that is kept for other programs and not read."""
 JSON_TOPICS = (GRASP, EVENT)
 """Topics whose messages are JSON."""
 SCHEMAS: dict[str, tuple[Any, ...]] = {
@@ -29,3 +27,5 @@ SCHEMAS: dict[str, tuple[Any, ...]] = {
     POINTS: (PointCloud,),
 }
 """Topics that are read as protobuf, and the message classes allowed on each."""
+FORCE = "/tool/force"
+"""Topic that is kept for other programs and not read."""
