@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 import jiggle_mj as jm
 
@@ -51,9 +52,13 @@ def main() -> None:
         scene = jm.load_scene(str(scene_file))
         with jm.Reference(scene, seed=0, sensing="particles") as reference:
             observations = [reference.step(action) for action in jm.programme(scene)]
-            attached = np.flatnonzero(reference.truth().attached)
+            truth = reference.truth()
     grasps = [observation for observation in observations if observation.tool.closed]
     points = np.stack([1e3 * observation.points.positions for observation in grasps if observation.points is not None])
+    # Tracks are numbered at random, not as the reference's vertices are: nearest at rest is the same point.
+    at_rest = observations[0].points
+    assert at_rest is not None
+    attached = np.sort(KDTree(at_rest.positions).query(truth.rest[truth.attached])[1])
     times = np.array([round(observation.time / NS_PER_MS) for observation in grasps])
     times -= times[0]
     np.savez_compressed(
