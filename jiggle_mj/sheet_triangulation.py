@@ -148,13 +148,13 @@ def fill_outline(
     """
     low, high = outline.min(axis=0), outline.max(axis=0)
     pitch = np.array([spacing, spacing * np.sqrt(3) / 2])
-    n_across, n_rows = np.ceil((high - low) / pitch).astype(int) + 1
-    if not n_across * n_rows <= MAX_ADDED:
+    across, rows = (float(length) for length in np.ceil((high - low) / pitch) + 1)
+    if not across * rows <= MAX_ADDED:
         raise MeshError(
             f"a sheet of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m at a spacing of {spacing:.3g} m has about "
-            f"{float(n_across) * float(n_rows):.3g} vertices; at most {MAX_ADDED} are allowed: give a larger spacing."
+            f"{across * rows:.3g} vertices; at most {MAX_ADDED} are allowed: give a larger spacing."
         )
-    row, column = np.mgrid[:n_rows, :n_across]
+    row, column = np.mgrid[: int(rows), : int(across)]
     lattice = low + np.column_stack([(column + 0.5 * (row % 2)).ravel(), row.ravel()]) * pitch
     border = np.concatenate(
         [

@@ -12,7 +12,7 @@ from .clock import FrameClock
 from .declaration import MeasuredRecording
 from .grasps import Grasp
 from .reports import Reports
-from .units import LENGTH_UNITS
+from .units import LENGTH_UNITS, PREFERRED_UNITS
 
 MIN_MOTION = 5e-3
 """Displacement of the tool from which its points must follow [m]: well above the noise and drift of trackers (1 to 4
@@ -75,12 +75,15 @@ def _refuse_far(
     tool, frame = given.grasp.tool, given.frame
     stated = given.unit if tool is None or tool.unit is None else tool.unit
     raw = (tip - frame.translation) / stated
-    distances = {
-        name: float(np.linalg.norm(places - (raw * metres + frame.translation), axis=1).min())
-        for name, metres in LENGTH_UNITS.items()
-    }
-    likely = min(distances, key=distances.__getitem__)
-    cure = f'give tool_unit = "{likely}", or ' if distances[likely] <= extent else ""
+    likely = next(
+        (
+            name
+            for name in PREFERRED_UNITS
+            if np.linalg.norm(places - (raw * LENGTH_UNITS[name] + frame.translation), axis=1).min() <= extent
+        ),
+        None,
+    )
+    cure = "" if likely is None else f'give tool_unit = "{likely}", or '
     raise RecordingError(
         f"{grasp.what}: the tool is {distance:.4g} m from the nearest held point when the jaws close, and the sheet "
         f"is {extent:.3g} m large: {cure}transform the tool into the frame of the points."

@@ -65,3 +65,19 @@ def test_the_documented_rubber_strip_reaches_both_grips(tmp_path):
     assert (0.019 - offset) / gradient == pytest.approx(0.016, abs=MILLIMETRE)
     truth = read_truth(summary.truth)
     assert truth.rest[truth.attached, 0].max() < -0.053 and not (truth.attached & mesh.held).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "n_frames", "n_points", "held", "n_attached"),
+    [
+        ("skin_1013", 22, 240, [26, 40, 41, 56], 30),
+        ("skin_1014", 19, 239, None, 28),
+        ("lift_4", 23, 354, [90, 91, 112, 113], 64),
+        ("human_skin", 50, 537, [], 34),
+    ],
+)
+def test_descriptions_that_init_began_are_imported(tmp_path, name, n_frames, n_points, held, n_attached):
+    summary = import_folder(measured(name), DOCUMENTED / f"{name}.toml", tmp_path / "run.mcap")
+    assert (summary.n_frames, summary.n_points, summary.n_attached) == (n_frames, n_points, n_attached)
+    first = next(iter(Recording.open(summary.recording)))
+    assert held is None or list(first.tool.held_tracks) == held

@@ -1,0 +1,91 @@
+"""`jiggle-mj init`: the recording.toml that it writes runs, and says what is guessed."""
+
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jiggle_mj.errors import OutputError, RecordingError
+from jiggle_mj.importing.folder import import_folder
+from jiggle_mj.importing.init import describe_folder
+from jiggle_mj.recording.reader import Recording
+from tests.support.tiny_scene import call
+
+SAMPLE = Path(__file__).parents[3] / "docs" / "recordings" / "sample"
+NOISE = 2e-4
+"""Noise of the sample [m]."""
+
+
+def frames() -> np.ndarray:
+    """Return 12 frames of an 8 x 8 sheet of 5 mm pitch [mm] that is lifted at row 0, with a noise of 0.05 mm."""
+    x, y = np.meshgrid(5.0 * np.arange(8), 5.0 * np.arange(8))
+    rest = np.column_stack([x.ravel(), y.ravel(), np.full(64, 100.0)])
+    share = np.exp(-np.linalg.norm(rest[:, :2], axis=1) / 8.0)
+    lifted = np.array([rest + step * share[:, None] * [0, 0, 1.0] for step in range(12)])
+    return lifted + np.random.default_rng(0).normal(scale=0.05, size=lifted.shape)
+
+
+def test_text_files_are_described(tmp_path):
+    for number, points in enumerate(frames()):
+        np.savetxt(tmp_path / f"f{number}.csv", points, delimiter=",", header="x,y,z", comments="")
+    description = describe_folder(tmp_path)
+    assert description.problem is None
+    given = tomllib.loads(description.text)
+    assert given["unit"] == "mm" and given["points"]["files"] == ["f*.csv"]
+    assert 0.3 * 5e-5 < given["noise_sd"] < 3 * 5e-5  # a guess that the user checks: within a factor of 3
+    assert 0 in given["grasp"]["rows"] and set(given["grasp"]["rows"]) <= {0, 1, 8, 9}
+    summary = import_folder(tmp_path, None, tmp_path / "run.mcap")
+    assert (summary.n_frames, summary.n_points) == (12, 64)
+
+
+def test_an_archive_with_units_a_tool_and_triangles_is_described(tmp_path):
+    points = frames()
+    np.savez(
+        tmp_path / "d.npz",
+        pts_mm=points,
+        stamp_ns=1_732_800_000_000_000_000 + 100_000_000 * np.arange(12),
+        tool_mm=points[:, 0],
+        tool_stamp_s=100.0 + 0.1 * np.arange(12),
+        faces=np.array([[1, 2, 9], [2, 10, 9]]),
+    )
+    description = describe_folder(tmp_path)
+    given = tomllib.loads(description.text)
+    assert (given["unit"], given["time_unit"], given["points"]["times"]) == ("mm", "ns", "stamp_ns")
+    assert given["mesh"] == {"faces": "faces", "first_vertex": 1}
+    grasp = given["grasp"]
+    assert (grasp["tool"], grasp["tool_times"], grasp["tool_time_unit"]) == ("tool_mm", "tool_stamp_s", "s")
+    assert grasp["tool_clock_offset"] == "start together"
+    assert description.problem is None
+
+
+def test_the_sample_is_what_init_writes_but_for_gravity_and_bed(tmp_path):
+    for name in ("tracks.npz", "attached.txt"):
+        shutil.copy(SAMPLE / name, tmp_path / name)
+    written = tomllib.loads(describe_folder(tmp_path).text)
+    shipped = tomllib.loads((SAMPLE / "recording.toml").read_text())
+    for changed in ("gravity", "bed"):
+        written["declaration"].pop(changed), shipped["declaration"].pop(changed)
+    assert written | {"name": "sample"} == shipped
+    assert NOISE / 1.5 < shipped["noise_sd"] < 1.5 * NOISE
+    assert sum(path.stat().st_size for path in SAMPLE.iterdir()) <= 200_000
+
+
+def test_a_recording_toml_is_never_replaced_and_an_empty_folder_is_refused(tmp_path):
+    with pytest.raises(RecordingError, match="holds no points"):
+        describe_folder(tmp_path)
+    (tmp_path / "recording.toml").write_text("mine")
+    with pytest.raises(OutputError, match="exists and is kept"):
+        describe_folder(tmp_path)
+    assert (tmp_path / "recording.toml").read_text() == "mine"
+
+
+def test_the_verb_writes_and_import_without_a_description_offers_it(tmp_path, monkeypatch, capsys):
+    np.savez(tmp_path / "d.npz", p=frames())
+    assert call(monkeypatch, "import", tmp_path, "--out", tmp_path / "run.mcap") == 1
+    assert "jiggle-mj init" in capsys.readouterr().err
+    assert call(monkeypatch, "init", tmp_path) == 0
+    assert "jiggle-mj import" in capsys.readouterr().err
+    assert call(monkeypatch, "import", tmp_path, "--out", tmp_path / "run.mcap") == 0
+    assert len(list(Recording.open(tmp_path / "run.mcap"))) == 12
