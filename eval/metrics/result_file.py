@@ -135,7 +135,7 @@ def _check(figures: Json, path: Path) -> None:
         entry(table(procedure), "acts", tables, f"{path}: procedure")
     for (section, name), kinds in KINDS_OF_ITEMS.items():
         holder = table(figures[section] or {}) if section else figures
-        for item in holder.get(name, []):
+        for item in tables(holder.get(name, [])):
             for key, kind in kinds.items():
                 entry(item, key, kind, f"{path}: {name}")
 

@@ -217,8 +217,9 @@ def _belief(arrays: StoredArrays, n: int, path: Path) -> Belief:
     return Belief(
         mean=arrays.numbers("mean", (n,)),
         covariance=arrays.numbers("covariance", (n, n)),
-        **{name: arrays.scalar(name) for name in ("reference",) if name in arrays},
-        **{name: arrays.numbers(name, (n,)) for name in ("lower", "upper") if name in arrays},
+        reference=_scalar(arrays, "reference"),
+        lower=arrays.numbers("lower", (n,)) if "lower" in arrays else None,
+        upper=arrays.numbers("upper", (n,)) if "upper" in arrays else None,
     )
 
 
@@ -226,11 +227,19 @@ def _detection(arrays: StoredArrays, result: dict[str, str], n: int, path: Path)
     _refuse_other_version(Detection, arrays, {"rule"}, path)
     return Detection(
         attached=arrays.flags("attached", (n,)),
-        **{name: arrays.numbers(name, (n,)) for name in ("score", "stiffness", "stiffness_sd")},
-        **{name: bool(arrays.flags(name, ())) for name in ("probabilistic", "converged") if name in arrays},
-        **{name: arrays.scalar(name) for name in ("force_sd_ratio", "position_sd_ratio") if name in arrays},
+        score=arrays.numbers("score", (n,)),
+        stiffness=arrays.numbers("stiffness", (n,)),
+        stiffness_sd=arrays.numbers("stiffness_sd", (n,)),
+        probabilistic=bool(arrays.flags("probabilistic", ())) if "probabilistic" in arrays else False,
+        converged=bool(arrays.flags("converged", ())) if "converged" in arrays else True,
+        force_sd_ratio=_scalar(arrays, "force_sd_ratio"),
+        position_sd_ratio=_scalar(arrays, "position_sd_ratio"),
         rule=entry(result, "rule", text, f"{path}: {RESULT_RECORD}"),
     )
+
+
+def _scalar(arrays: StoredArrays, name: str) -> float | None:
+    return arrays.scalar(name) if name in arrays else None
 
 
 def _skipped(result: dict[str, str], path: Path) -> tuple[tuple[int, str], ...]:

@@ -19,7 +19,8 @@ from ..errors import OutputError
 
 PARTIAL_SUFFIX = ".part"
 """End of the name of a file that is not complete."""
-Parameters, Returned = ParamSpec("Parameters"), TypeVar("Returned")
+Parameters = ParamSpec("Parameters")
+Returned = TypeVar("Returned")
 
 
 def partial_path(path: Path) -> Path:

@@ -145,8 +145,8 @@ def read_truth(path: str | os.PathLike[str], *, allow_truncated: bool = False) -
     if n == 0:
         raise RecordingError(f"{path} is damaged: {TRUTH_REST} has no vertices.")
     frames = tuple(
-        _parse_frame(*frame, n, path)
-        for frame in content.frames(TRUTH_POINTS, TRUTH_TOOL, TRUTH_FRAME, complete=not allow_truncated)
+        _parse_frame(points, tool, frame, n, path)
+        for points, tool, frame in content.frames(TRUTH_POINTS, TRUTH_TOOL, TRUTH_FRAME, complete=not allow_truncated)
     )
     refuse_disorder(frames, path)
     where = f"{path}: {DETAILS}"
