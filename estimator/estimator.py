@@ -32,7 +32,7 @@ from .filters.posterior_summary import Convergence, PosteriorSummary
 from .fusion import fill_unseen, fuse, pull
 from .grip import GripHold, GripTracker
 from .identification import identify
-from .perception import Disparity, Perception, SimulatorInput, TissueMask, Track
+from .perception import Disparity, FrameMask, Perception, SimulatorInput, TissueMask, Track
 from .physics.environment import Grip
 from .tracked_sheet import TrackedSheet
 
@@ -49,7 +49,7 @@ class Estimator:
         camera: StereoCamera | None = None,
         *,
         config: EstimatorConfig | None = None,
-        mask: TissueMask | None = None,
+        mask: TissueMask | FrameMask | None = None,
         disparity: Disparity | None = None,
     ):
         """Take what is known before the first frame.

@@ -3,6 +3,9 @@
 Wrong arguments raise `ValueError`; every class here is a `JiggleError`, which the command line prints as one line.
 """
 
+import numpy as np
+from jaxtyping import Bool
+
 
 class JiggleError(Exception):
     """Base of the errors that a user can correct: the message says what was given, what is allowed, what to do."""
@@ -22,6 +25,20 @@ class ObservationError(RecordingError, ValueError):
 
 class PerceptionError(JiggleError):
     """The images cannot be used: no tissue in view, cameras swapped, sizes that differ."""
+
+
+class MaskError(PerceptionError):
+    """The built-in segmentation by colour is not sure which pixels are tissue."""
+
+    def __init__(self, message: str, mask: Bool[np.ndarray, "height width"]) -> None:
+        """Keep what was taken for tissue beside the message."""
+        super().__init__(message)
+        self.mask = mask
+        """Pixels of the rectified left image that were taken for tissue."""
+
+    def __reduce__(self) -> tuple[type["MaskError"], tuple[str, Bool[np.ndarray, "height width"]]]:
+        """Return how to make it again in another process."""
+        return MaskError, (str(self), self.mask)
 
 
 class MeshError(JiggleError):

@@ -15,6 +15,7 @@ from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, Tool
 
 from ..config import EstimatorConfig
 from ..estimator import Estimator
+from ..perception import FrameMask, TissueMask
 from .grasped_frames import ClosedFrame, Timed
 from .held_shape import another_shape
 from .still_noise import StillNoise, measure
@@ -54,6 +55,7 @@ def collect_dataset(
     observations: Iterable[Observation],
     *,
     config: EstimatorConfig | None = None,
+    mask: TissueMask | FrameMask | None = None,
     on_frame: Callable[[Observation, Estimate | None], None] = lambda observation, found: None,
 ) -> Dataset:
     """Run the estimator over a recording and return its frames with closed jaws.
@@ -62,6 +64,7 @@ def collect_dataset(
         declaration: of the sheet.
         camera: None for tracked points.
         observations: all of the recording.
+        mask: see `Estimator`.
         config: of the estimator; its refinement is set to "end".
         on_frame: called after each frame.
 
@@ -69,7 +72,7 @@ def collect_dataset(
         PerceptionError: no frame with closed jaws could be used.
     """
     config = replace(config or EstimatorConfig(), refinement="end")
-    estimator, frames, stated_sd = Estimator(declaration, camera, config=config), [], ASSUMED_SD
+    estimator, frames, stated_sd = Estimator(declaration, camera, config=config, mask=mask), [], ASSUMED_SD
     still: list[MeasuredPoints] = []
     resting: dict[int, list[MeasuredPoints]] = {}
     grasp, closed = -1, 0

@@ -7,14 +7,17 @@ images: `rectified` -> `tissue_mask`, `disparity` -> `sheet_mesh` -> (`material_
 
 from .config import PerceptionConfig
 from .disparity import Disparity, SemiGlobalMatching
+from .grab_cut import GrabCut
 from .perception import Perception, SimulatorInput
 from .point_tracker import PointTracker
 from .stereo_tracker import StereoTracker
-from .tissue_mask import TissueMask, WarmTissue
+from .tissue_mask import FrameMask, TissueMask, WarmTissue
 from .track import Track
 
 __all__ = [
     "Disparity",
+    "FrameMask",
+    "GrabCut",
     "Perception",
     "PerceptionConfig",
     "PointTracker",

@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 
 from jiggle_mj.argument_checks import as_function, as_instance
 from jiggle_mj.camera import StereoCamera
-from jiggle_mj.errors import PerceptionError
+from jiggle_mj.errors import MaskError, PerceptionError
 from jiggle_mj.estimate import Sheet
-from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
+from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair
 
 from ..physics.environment import Grip
 from .cloud_tracker import CloudTracker, lay_mesh
@@ -20,7 +20,7 @@ from .config import PerceptionConfig
 from .disparity import Disparity
 from .point_tracker import PointTracker
 from .stereo_tracker import StereoTracker
-from .tissue_mask import TissueMask
+from .tissue_mask import FrameMask, TissueMask
 from .track import Track
 
 SimulatorInput = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Grip]
@@ -36,7 +36,7 @@ class Perception:
         camera: StereoCamera | None,
         *,
         spacing: float,
-        mask: TissueMask | None,
+        mask: TissueMask | FrameMask | None,
         disparity: Disparity | None,
         config: PerceptionConfig | None = None,
     ) -> None:
@@ -96,7 +96,7 @@ class Perception:
         if observation.images is not None and self._stereo is not None:
             if self._sheet is not None:
                 return None
-            reason = self._start_stereo(observation.images, observation.tool)
+            reason = self._start_stereo(observation.images, observation)
             if reason is None:
                 self._still_times = [observation.time]
             return reason
@@ -149,17 +149,24 @@ class Perception:
             PerceptionError: the frame has no usable measurement.
         """
         if observation.images is not None and self._stereo is not None:
-            return self._stereo.track(observation.images, observation.tool, predicted=predicted)
+            return self._stereo.track(
+                observation.images, observation.tool, predicted=predicted, index=observation.index
+            )
         points = _points(observation)
         return self._points.track(points) if self._clouds is None else self._clouds.track(points, *simulator_input())
 
-    def _start_stereo(self, images: StereoPair, tool: ToolState) -> str | None:
-        """Lay the mesh over a pair, and return None, or why it is skipped; with closed jaws no other pair will come."""
+    def _start_stereo(self, images: StereoPair, observation: Observation) -> str | None:
+        """Lay the mesh over a pair, and return None, or why it is skipped.
+
+        With closed jaws no other pair will come, and no other pair removes a doubt about the mask.
+        """
         assert self._stereo is not None
         try:
-            self._sheet = self._stereo.start(images, tool)
+            self._sheet = self._stereo.start(images, observation.tool, index=observation.index)
+        except MaskError:
+            raise
         except PerceptionError as failure:
-            if tool.closed:
+            if observation.tool.closed:
                 raise
             return str(failure)
         return None

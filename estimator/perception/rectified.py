@@ -9,7 +9,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from jiggle_mj.camera import CameraCalibration, StereoCamera
 from jiggle_mj.errors import PerceptionError
@@ -83,6 +83,20 @@ class Rectifier:
             right_fine=double(grey[1]),
             black_side="left" if self._is_black(grey[0]) else "right" if self._is_black(grey[1]) else None,
         )
+
+    def mask(self, mask: Bool[np.ndarray, "h w"], side: Literal["left", "right"]) -> Bool[np.ndarray, "height width"]:
+        """Return a mask of a raw image as one of the rectified image.
+
+        Raises:
+            PerceptionError: the mask is not of the calibrated size.
+        """
+        if mask.shape != self._size:
+            raise PerceptionError(
+                f"the mask of the {side} image is {mask.shape[1]}x{mask.shape[0]} px and the image "
+                f"{self._size[1]}x{self._size[0]} px; draw it on the recorded image."
+            )
+        maps = self._maps[side == "right"]
+        return mask if maps is None else cv2.remap(mask.astype(np.uint8), *maps, cv2.INTER_NEAREST).astype(bool)
 
     def _is_black(self, grey: Float[np.ndarray, "height width"]) -> bool:
         """Return whether an image shows nothing but sensor noise."""

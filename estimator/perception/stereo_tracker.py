@@ -6,6 +6,7 @@ the tissue's mechanics nor the truth; the caller's predicted positions are one m
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -19,13 +20,14 @@ from jiggle_mj.observation import StereoPair, ToolState
 from .config import StereoTrackerConfig
 from .disparity import Disparity, SemiGlobalMatching
 from .flow import dense_flow, flow_at
+from .mask_doubts import refuse_doubtful, refuse_grey
 from .material_map import MaterialMap
 from .mesh_field import MeshField
 from .rectified import RectifiedPair, Rectifier
 from .registration import FINE_STEPS, MaterialRegistration, Registered, refine_disparity
 from .resampling import sample_mask
 from .sheet_mesh import DisparitySurface, lay_mesh
-from .tissue_mask import TissueMask, WarmTissue, largest_blob
+from .tissue_mask import FrameMask, TissueMask, WarmTissue, largest_blob
 from .track import UNSEEN_VARIANCE, Track
 
 COARSE_STEPS = 2
@@ -52,7 +54,7 @@ class StereoTracker:
         camera: StereoCamera,
         *,
         spacing: float = 4.4e-3,
-        mask: TissueMask | None = None,
+        mask: TissueMask | FrameMask | None = None,
         disparity: Disparity | None = None,
         config: StereoTrackerConfig | None = None,
     ):
@@ -61,7 +63,7 @@ class StereoTracker:
         Args:
             camera: the calibrated pair.
             spacing: distance between neighbouring particles [m].
-            mask: segmentation of tissue; `WarmTissue()` if None.
+            mask: segmentation of tissue; if None `WarmTissue()`, which is refused where it is in doubt.
             disparity: dense disparity; `SemiGlobalMatching.for_camera` if None.
             config: thresholds and noise; the defaults if None.
 
@@ -73,23 +75,34 @@ class StereoTracker:
         self._camera, self._spacing = camera, spacing
         self._config = config = config or StereoTrackerConfig()
         self._mask = WarmTissue() if mask is None else mask
+        self._by_colour = mask is None
         self._disparity = (
             SemiGlobalMatching.for_camera(camera, min_depth=config.min_depth) if disparity is None else disparity
         )
         self._rectify = Rectifier(camera, config)
         self._previous: _PreviousFrame | None = None
 
-    def start(self, images: StereoPair, tool: ToolState) -> Sheet:
+    def start(self, images: StereoPair, tool: ToolState, *, index: int = 0) -> Sheet:
         """Return the mesh laid over the first pair; the tissue should be at rest.
 
+        Args:
+            images: raw pair.
+            tool: state of the tweezer.
+            index: of the frame, for a `FrameMask`.
+
         Raises:
+            MaskError: the built-in segmentation is in doubt.
             PerceptionError: black image, no tissue, two sheets, no disparity, or too few particles.
         """
         config = self._config
         pair = self._rectify(images)
         if pair.black_side is not None:
             raise PerceptionError(f"the {pair.black_side} image is black; check the light, the exposure and the cable.")
-        tissue = largest_blob(self._mask(pair.left), smallest=config.mesh.min_sheet)
+        if self._by_colour:
+            refuse_grey(pair.left)
+        tissue = largest_blob(self._tissue(pair, "left", index, rest=True), smallest=config.mesh.min_sheet)
+        if self._by_colour:
+            refuse_doubtful(pair.left, tissue)
         dense = self._disparity(pair.left, pair.right)
         mesh = lay_mesh(tissue, dense, self._camera, spacing=self._spacing, config=config.mesh)
         uv = mesh.uvd[:, :2]
@@ -98,7 +111,7 @@ class StereoTracker:
         refined = refine_disparity(
             pair.left_fine,
             pair.right_fine,
-            (tissue, self._mask(pair.right)),
+            (tissue, self._tissue(pair, "right", index, rest=True)),
             uv,
             mesh.uvd[:, 2],
             self._material,
@@ -121,13 +134,16 @@ class StereoTracker:
         self._previous = _PreviousFrame(grey=pair.left_grey, uvd=uvd, visible=everywhere, tool=tool)
         return Sheet(rest=self._camera.back_project(uvd), faces=mesh.faces)
 
-    def track(self, images: StereoPair, tool: ToolState, *, predicted: Float[np.ndarray, "n 3"]) -> Track:
+    def track(
+        self, images: StereoPair, tool: ToolState, *, predicted: Float[np.ndarray, "n 3"], index: int = 0
+    ) -> Track:
         """Return the measurement of the particles in one more pair.
 
         Args:
             images: raw pair.
             tool: present state of the tweezer; after a new grasp or opened jaws the rest shape is one initial guess.
             predicted: predicted particle positions [m], the initial guess of unseen particles.
+            index: of the frame, for a `FrameMask`.
 
         Raises:
             ValueError: called before `start`.
@@ -138,7 +154,7 @@ class StereoTracker:
         pair = self._rectify(images)
         if pair.black_side is not None:
             return self._measurement(last.uvd, np.zeros(len(last.uvd), bool), np.zeros((len(last.uvd), 3, 3)))
-        tissue, tissue_right = self._mask(pair.left), self._mask(pair.right)
+        tissue, tissue_right = (self._tissue(pair, side, index, rest=False) for side in ("left", "right"))
         start = self._guess(pair, tissue, last, tool, self._camera.project(predicted))
         match = config.registration
         windows = (*COARSE_STEPS * (match.coarse_window,), *FINE_STEPS * (match.fine_window,))
@@ -165,6 +181,14 @@ class StereoTracker:
         noise[:, :2, :2] = lateral[:, None, None] * np.eye(2) + config.noise_factor**2 * plane.spread
         noise[:, 2, 2] = config.disparity_sd**2 + config.noise_factor**2 * depth.spread[:, 0, 0]
         return self._measurement(uvd, visible, config.variance_inflation * noise)
+
+    def _tissue(
+        self, pair: RectifiedPair, side: Literal["left", "right"], index: int, *, rest: bool
+    ) -> Bool[np.ndarray, "height width"]:
+        """Return the tissue pixels of one rectified image."""
+        if isinstance(self._mask, FrameMask):
+            return self._rectify.mask(self._mask.at(index, side, rest=rest), side)
+        return self._mask(pair.left if side == "left" else pair.right)
 
     def _guess(
         self,

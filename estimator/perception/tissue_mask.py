@@ -2,12 +2,12 @@
 
 The shipped `WarmTissue` assumes that soft tissue is warm on the red-green axis of CIE L*a*b*: perfused tissue is red to
 yellow, instruments are grey, drapes and beds are green, blue or grey. It splits the warm side by Otsu's threshold (Otsu
-1979, doi:10.1109/TSMC.1979.4310076). A learned model plugs in through `TissueMask`. `largest_blob` then selects the
-sheet, and refuses two sheets.
+1979, doi:10.1109/TSMC.1979.4310076). A learned model plugs in through `TissueMask`, masks of a file through
+`FrameMask`. `largest_blob` then selects the sheet, and refuses two sheets.
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -29,6 +29,24 @@ class TissueMask(Protocol):
 
     def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Bool[np.ndarray, "height width"]:
         """Return the tissue pixels of an RGB image."""
+        ...
+
+
+@runtime_checkable
+class FrameMask(Protocol):
+    """Tissue pixels that are known for each frame, drawn by hand or by another program."""
+
+    def at(self, index: int, side: Literal["left", "right"], *, rest: bool) -> Bool[np.ndarray, "height width"]:
+        """Return the tissue pixels of a raw image; all where nothing is known.
+
+        Args:
+            index: `Observation.index` of the frame.
+            side: which camera's image.
+            rest: whether the mesh is laid over this image.
+
+        Raises:
+            PerceptionError: there is no mask of this frame, and one is needed.
+        """
         ...
 
 
@@ -75,12 +93,12 @@ def largest_blob(mask: Bool[np.ndarray, "height width"], *, smallest: int) -> Bo
         area = int(areas.max()) if areas.size else 0
         raise PerceptionError(
             f"no tissue in view: the largest patch of tissue colour has {area} px, at least {smallest} are needed; "
-            "point the camera at the tissue, or pass a mask for its colour."
+            "point the camera at the tissue, or say which pixels are tissue with --mask (or Estimator's mask)."
         )
     order = np.argsort(-areas, kind="stable")
     if areas.size > 1 and areas[order[1]] > MAX_SECOND_BLOB * areas[order[0]]:
         raise PerceptionError(
             f"two disconnected sheets in view ({areas[order[0]]} and {areas[order[1]]} px); only one sheet "
-            "can be tracked: cover the other, or pass a mask that leaves it out."
+            "can be tracked: cover the other, or pass a mask that leaves it out (--mask)."
         )
     return labels == order[0] + 1

@@ -60,6 +60,8 @@ class Run:
     """Actions that a policy planned, in order."""
     ended: str | None = None
     """Reason why a policy planned no more."""
+    settings: Json | None = None
+    """What was declared and set, and where it came from; see `settings_used`."""
     procedure: Json | None = None
     """Name of a procedure that cuts or sews, and what was seen of each act; see `acting.acts`."""
 
@@ -77,6 +79,7 @@ def result(run: Run) -> Json:
         "estimator": run.estimator,
         "policy": run.policy,
         "disturbances": run.disturbances,
+        "settings": run.settings,
         "n_particles": len(episode.sheet.rest),
         "n_frames": episode.n_frames,
         "detection": {

@@ -5,7 +5,7 @@ after.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
 from jiggle_mj.estimator.attribution.suggestion import suggest
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
+from jiggle_mj.estimator.perception import FrameMask, TissueMask
 from jiggle_mj.recording.declaration import version_entry
 from jiggle_mj.recording.output_files import fills_folder, write_text
 from jiggle_mj.recording.reader import PAIRING_TOLERANCE_NS, Recording
@@ -34,6 +35,7 @@ from ..metrics.result import agreements
 from ..metrics.result_file import Json
 from ..metrics.truth_transfer import transfer
 from ..report.discrepancy_page import write_page
+from .settings_used import settings_used, with_declared
 
 DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
 
@@ -46,6 +48,9 @@ def close_loop(
     truth: Path | None = None,
     library: tuple[Effect, ...] = LIBRARY,
     suggestion: bool = False,
+    config: EstimatorConfig | None = None,
+    declare: Mapping[str, Any] | None = None,
+    mask: TissueMask | FrameMask | None = None,
     overwrite: bool = False,
     allow_truncated: bool = False,
     tolerance_ns: int = PAIRING_TOLERANCE_NS,
@@ -60,6 +65,9 @@ def close_loop(
         truth: a truth file, to score the detected attachments before and after; opened after everything is decided.
         library: effects that are tested; `(*LIBRARY, mine)` adds one.
         suggestion: search the pull that best distinguishes the effects that these frames do not.
+        config: of the estimator.
+        declare: properties of the tissue by name, over those of the recording; see `Declaration`.
+        mask: see `Estimator`.
         overwrite: replace an earlier run's files.
         allow_truncated: use the complete part of a recording, and of a truth, that was cut off.
         tolerance_ns: largest difference between the stamps of one frame [ns].
@@ -78,12 +86,12 @@ def close_loop(
     own = (DISCREPANCY, PAGE)
     check_directory(directory, own, overwrite=overwrite)
     clear_directory(directory, own)
-    dataset = collect_dataset(
-        recording.declaration, recording.camera, recording, config=EstimatorConfig(), on_frame=on_frame
-    )
+    declaration = with_declared(recording.declaration, declare)
+    dataset = collect_dataset(declaration, recording.camera, recording, config=config, mask=mask, on_frame=on_frame)
+    used = settings_used(declaration, dataset.estimator.config, declare=declare, declared=recording.declared)
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(dataset, library=library, log=log)
-        found = version_entry() | discrepancy(closed, dataset)
+        found = version_entry() | discrepancy(closed, dataset) | {"settings": used}
     sheet, name = dataset.estimator.sheet, recording.metadata.get("name", recording_path.stem)
 
     def write() -> None:

@@ -5,11 +5,11 @@ written.
 """
 
 import platform
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jiggle_mj.actions import Grasp
 from jiggle_mj.argument_checks import as_instance, as_path
@@ -31,7 +31,7 @@ from jiggle_mj.episode import (
 )
 from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
-from jiggle_mj.estimator.perception import Disparity, TissueMask
+from jiggle_mj.estimator.perception import Disparity, FrameMask, TissueMask
 from jiggle_mj.estimator.planning.policy import INTERRUPTED, Policy
 from jiggle_mj.observation import StereoPair
 from jiggle_mj.recording.estimate import EstimateRecording, read_estimate
@@ -52,6 +52,7 @@ from ..metrics.result_file import (
 )
 from ..report.run_page import shown_steps, write_report
 from .acting import actions, acts, check_policy_fits, policy_named
+from .settings_used import settings_used, with_declared
 
 if TYPE_CHECKING:
     from jiggle_mj.options import Sensing
@@ -72,7 +73,8 @@ def run_scene(
     planner: Policy | None = None,
     steps: int | None = None,
     config: EstimatorConfig | None = None,
-    mask: TissueMask | None = None,
+    declare: Mapping[str, Any] | None = None,
+    mask: TissueMask | FrameMask | None = None,
     disparity: Disparity | None = None,
     overwrite: bool = False,
     on_frame: OnFrame | None = None,
@@ -89,6 +91,7 @@ def run_scene(
         planner: plans in place of the policy of that name.
         steps: most actions of a policy; the programme has its own number.
         config: of the estimator.
+        declare: properties of the tissue by name, over those that are declared already; see `Declaration`.
         mask: see `Estimator`.
         disparity: see `Estimator`.
         overwrite: replace an earlier run's files.
@@ -114,7 +117,8 @@ def run_scene(
     check_directory(directory, own, overwrite=overwrite)
     watch = Stopwatch()
     with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference:
-        estimator = Estimator(reference.declaration, reference.camera, config=config, mask=mask, disparity=disparity)
+        declaration = with_declared(reference.declaration, declare)
+        estimator = Estimator(declaration, reference.camera, config=config, mask=mask, disparity=disparity)
         clear_directory(directory, own)
         description = "" if planner is None else f"{policy}, {steps} steps, {settings(estimator.config)}"
         salt = new_salt(scene)
@@ -144,6 +148,7 @@ def run_scene(
         estimator=estimator.config.filter,
         policy=policy,
         disturbances=reference.metadata.get("disturbances"),
+        settings=settings_used(declaration, estimator.config, declare=declare, declared=True),
         simulation_s=watch.seconds,
         limits=scene.limits.limits(),
         decisions=() if planner is None else tuple(planner.decisions),
@@ -163,7 +168,8 @@ def run_estimator(
     directory: Path,
     *,
     config: EstimatorConfig | None = None,
-    mask: TissueMask | None = None,
+    declare: Mapping[str, Any] | None = None,
+    mask: TissueMask | FrameMask | None = None,
     disparity: Disparity | None = None,
     overwrite: bool = False,
     allow_truncated: bool = False,
@@ -176,6 +182,7 @@ def run_estimator(
         recording_path: the MCAP file.
         directory: where the files go.
         config: of the estimator.
+        declare: properties of the tissue by name, over those that are declared already; see `Declaration`.
         mask: see `Estimator`.
         disparity: see `Estimator`.
         overwrite: replace an earlier run's files.
@@ -193,7 +200,8 @@ def run_estimator(
     recording = Recording.open(recording_path, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     own = (ESTIMATE, RESULT, REPORT)
     check_directory(directory, own, overwrite=overwrite)
-    estimator = Estimator(recording.declaration, recording.camera, config=config, mask=mask, disparity=disparity)
+    declaration = with_declared(recording.declaration, declare)
+    estimator = Estimator(declaration, recording.camera, config=config, mask=mask, disparity=disparity)
     clear_directory(directory, own)
     name = recording.metadata.get("name", recording_path.stem)
     about = {RECORDED: name, IDENTITY: recording.metadata.get("identity", ""), TOLERANCE: str(tolerance_ns)}
@@ -206,6 +214,7 @@ def run_estimator(
         estimator=estimator.config.filter,
         policy="recorded",
         disturbances=recording.metadata.get("disturbances"),
+        settings=settings_used(declaration, estimator.config, declare=declare, declared=recording.declared),
     )
     figures = result(run)
     write_result(directory / RESULT, figures)
@@ -279,9 +288,11 @@ def _report(
         raise OutputError(f"{directory / ESTIMATE} ends before its belief; estimate the recording again.")
     opened = None if recording is None else Recording.open(recording, allow_truncated=True, tolerance_ns=tolerance_ns)
     settings: dict[str, object] = {"estimate": dict(read_estimate(directory / ESTIMATE).metadata)}
-    if opened is not None:
-        declared = asdict(opened.declaration)
-        settings["declared"] = {key: value for key, value in declared.items() if key != "mesh"}
+    used = figures.get("settings")
+    if isinstance(used, dict):
+        settings["declared"] = {
+            name: f"{entry['value']} ({entry['from']})" for name, entry in used["declaration"].items()
+        }
     settings["versions"] = {name: version(name) for name in REPORTED_PACKAGES} | {"python": platform.python_version()}
     pairs: dict[int, StereoPair] = {}
     if opened is not None and opened.camera is not None:

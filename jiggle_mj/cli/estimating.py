@@ -7,7 +7,20 @@ from pathlib import Path
 from rich.table import Table
 
 from ..options import FilterName, PolicyName, Sensing
-from .options import PAIRING_TOLERANCE_MS, AsJson, Disturb, Name, Out, PairingTolerance, PathArgument, in_ns
+from .options import (
+    AS_DECLARED,
+    AS_RECORDED,
+    AsJson,
+    Disturb,
+    Name,
+    Out,
+    PathArgument,
+    RecordingSettings,
+    Settings,
+    in_ns,
+)
+from .settings import configured, declared
+from .survey import check_before
 from .terminal import INTERRUPTED, console, deferred_interrupt, progress, show, stop
 
 
@@ -22,6 +35,7 @@ def run(
     estimator: FilterName = "implicit",
     seed: int = 0,
     disturb: Disturb = (),
+    settings: Settings = AS_DECLARED,
     overwrite: bool = False,
     as_json: AsJson = False,
 ) -> None:
@@ -42,10 +56,10 @@ def run(
         seed: seed of the sensing noise.
         disturb: a disturbance that the estimator is not told of, such as gravity=0.5; may be repeated.
             docs/DISTURBANCES.md lists the names.
+        settings: what is declared to the estimator, and how it is set.
         overwrite: replace the results in the folder; they are removed when the run begins.
         as_json: print result.json to stdout.
     """
-    from jiggle_mj.estimator import EstimatorConfig
     from jiggle_mj.eval.runs.acting import most_actions
     from jiggle_mj.eval.runs.experiment import run_scene
     from jiggle_mj.scenes import disturbed, load_scene
@@ -53,7 +67,8 @@ def run(
     from ..recording.bag_refusal import refuse_bag
 
     refuse_bag(Path(scene))
-    scene_to_run, config = disturbed(load_scene(scene), disturb), EstimatorConfig(filter=estimator)
+    scene_to_run = disturbed(load_scene(scene), disturb)
+    config = configured(settings.config, settings.set, estimator)
     n_actions = most_actions(scene_to_run, policy, steps)
     with deferred_interrupt() as stopped, progress(n_actions, f"run {scene_to_run.name}") as on_frame:
         figures = run_scene(
@@ -64,6 +79,7 @@ def run(
             policy=policy,
             steps=steps,
             config=config,
+            declare=declared(settings.declare),
             overwrite=overwrite,
             on_frame=on_frame,
             stop=stopped,
@@ -79,7 +95,7 @@ def estimate(
     *,
     out: Out,
     estimator: FilterName = "implicit",
-    pairing_tolerance: PairingTolerance = PAIRING_TOLERANCE_MS,
+    settings: RecordingSettings = AS_RECORDED,
     allow_truncated: bool = False,
     overwrite: bool = False,
     as_json: AsJson = False,
@@ -91,23 +107,28 @@ def estimate(
         out: folder for estimate.mcap, result.json and report.html.
         estimator: implicit is ours; explicit is the paper's filter and adam the paper's baseline; nnls and unscented
             are further baselines.
-        pairing_tolerance: largest difference between the stamps of the images of one frame [ms].
+        settings: what is declared of the tissue, how the estimator is set, and which pixels are tissue.
         allow_truncated: use the complete frames of a recording that was cut off.
         overwrite: replace the results in the folder.
         as_json: print result.json to stdout.
     """
-    from jiggle_mj.estimator import EstimatorConfig
     from jiggle_mj.eval.runs.experiment import run_estimator
+    from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
 
     from ..recording.reader import Recording
 
-    tolerance_ns = in_ns(pairing_tolerance)
-    length = len(Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns))
-    with progress(length, f"estimate {recording.name}") as on_frame:
+    config, declare = configured(settings.config, settings.set, estimator), declared(settings.declare)
+    mask = None if settings.mask is None else mask_named(settings.mask)
+    tolerance_ns = in_ns(settings.pairing_tolerance)
+    source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
+    check_before(source, recording, declare, allow_implausible=settings.allow_implausible)
+    with mask_shown(out), progress(len(source), f"estimate {recording.name}") as on_frame:
         figures = run_estimator(
             recording,
             out,
-            config=EstimatorConfig(filter=estimator),
+            config=config,
+            declare=declare,
+            mask=mask,
             overwrite=overwrite,
             allow_truncated=allow_truncated,
             tolerance_ns=tolerance_ns,
@@ -120,7 +141,7 @@ def identify(
     recording: PathArgument,
     /,
     *,
-    pairing_tolerance: PairingTolerance = PAIRING_TOLERANCE_MS,
+    settings: RecordingSettings = AS_RECORDED,
     allow_truncated: bool = False,
     as_json: AsJson = False,
 ) -> None:
@@ -128,18 +149,24 @@ def identify(
 
     Args:
         recording: an MCAP file of observations.
-        pairing_tolerance: largest difference between the stamps of the images of one frame [ms].
+        settings: what is declared of the tissue, how the estimator is set, and which pixels are tissue.
         allow_truncated: use the complete frames of a recording that was cut off.
         as_json: print the ratios, the refusals and the resulting declaration to stdout as JSON.
     """
     from jiggle_mj.estimator import Estimator
+    from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
+    from jiggle_mj.eval.runs.settings_used import with_declared
 
     from .. import episode
     from ..recording.reader import Recording
 
-    source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=in_ns(pairing_tolerance))
-    estimator = Estimator(source.declaration, source.camera)
-    with progress(len(source), f"estimate {recording.name}") as on_frame:
+    config, declare = configured(settings.config, settings.set, "implicit"), declared(settings.declare)
+    mask = None if settings.mask is None else mask_named(settings.mask)
+    tolerance_ns = in_ns(settings.pairing_tolerance)
+    source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
+    check_before(source, recording, declare, allow_implausible=settings.allow_implausible)
+    estimator = Estimator(with_declared(source.declaration, declare), source.camera, config=config, mask=mask)
+    with mask_shown(Path()), progress(len(source), f"estimate {recording.name}") as on_frame:
         episode.estimate(source, estimator, on_frame=on_frame)
     with console.status("weight and bending") as status:
         material = estimator.identify(
@@ -172,7 +199,7 @@ def close_loop(
     out: Out,
     truth: Path | None = None,
     suggest: bool = False,
-    pairing_tolerance: PairingTolerance = PAIRING_TOLERANCE_MS,
+    settings: RecordingSettings = AS_RECORDED,
     allow_truncated: bool = False,
     overwrite: bool = False,
     as_json: AsJson = False,
@@ -184,7 +211,7 @@ def close_loop(
         out: folder for discrepancy.json and discrepancy.html.
         truth: a truth file, to score the detected attachments before and after; it is read after the verdict.
         suggest: where several effects explain the frames, search the next pull that discriminates between them.
-        pairing_tolerance: largest difference between the stamps of the images of one frame [ms].
+        settings: what is declared of the tissue, how the estimator is set, and which pixels are tissue.
         allow_truncated: use the complete frames of a recording that was cut off.
         overwrite: replace the results in the folder.
         as_json: print discrepancy.json to stdout.
@@ -192,17 +219,24 @@ def close_loop(
     from jiggle_mj.eval.report.discrepancy_page import story
     from jiggle_mj.eval.runs.closing_the_loop import PAGE
     from jiggle_mj.eval.runs.closing_the_loop import close_loop as close
+    from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
 
     from ..recording.reader import Recording
 
-    tolerance_ns = in_ns(pairing_tolerance)
-    length = len(Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns))
-    with progress(length, f"follow {recording.name}") as on_frame:
+    config, declare = configured(settings.config, settings.set, "implicit"), declared(settings.declare)
+    mask = None if settings.mask is None else mask_named(settings.mask)
+    tolerance_ns = in_ns(settings.pairing_tolerance)
+    source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
+    check_before(source, recording, declare, allow_implausible=settings.allow_implausible)
+    with mask_shown(out), progress(len(source), f"follow {recording.name}") as on_frame:
         discrepancy = close(
             recording,
             out,
             truth=truth,
             suggestion=suggest,
+            config=config,
+            declare=declare,
+            mask=mask,
             allow_truncated=allow_truncated,
             tolerance_ns=tolerance_ns,
             overwrite=overwrite,

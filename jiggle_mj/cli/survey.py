@@ -1,7 +1,8 @@
 """The check before an estimate: the survey of a recording as a table, its problems as lines."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
@@ -33,6 +34,26 @@ def check(recording: Recording, path: Path, *, allow_implausible: bool = False) 
         reasons = " ".join(f"{problem.name}: {problem.text}" for problem in refused)
         raise RecordingError(f"{path} is implausible. {reasons} (--allow-implausible goes on nevertheless)")
     return surveyed
+
+
+def check_before(recording: Recording, path: Path, declare: Mapping[str, Any], *, allow_implausible: bool) -> None:
+    """Check a recording before it is estimated, and say what is assumed of its tissue.
+
+    Args:
+        recording: an open recording.
+        path: its file, for messages.
+        declare: properties that the command line declares.
+        allow_implausible: see `check`.
+
+    Raises:
+        RecordingError: the recording is implausible.
+    """
+    from jiggle_mj.eval.runs.settings_used import assumed
+
+    check(recording, path, allow_implausible=allow_implausible)
+    assumption = assumed(recording.declaration, declare=declare, declared=recording.declared)
+    if assumption is not None:
+        console.print(assumption, style="bold yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 def show_survey(path: Path) -> Survey:

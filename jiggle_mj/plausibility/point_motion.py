@@ -1,4 +1,4 @@
-"""Measured points over the frames: size, motion, and what was never seen. One frame is kept at a time."""
+"""Measured points over the frames of a recording: size, motion, and what was never seen; few frames are kept."""
 
 from collections.abc import Sequence
 

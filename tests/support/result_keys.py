@@ -8,6 +8,7 @@ KEYS = {
         "by_dilation": BY_DILATION,
         "observable": {"by_dilation": BY_DILATION},
     },
+    "settings": None,
     "noise": dict.fromkeys(("force_sd_ratio", "position_sd_ratio")),
     "calibration": dict.fromkeys(("nees_per_dof", "nees_attached", "coverage_90", "coverage_attached", "ece")),
     "tracking": {"rms_m": None},
