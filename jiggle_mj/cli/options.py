@@ -15,7 +15,7 @@ Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 AsJson = Annotated[bool, tyro.conf.arg(name="json")]
 Disturb = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[=MAGNITUDE]")]]
 PAIRING_TOLERANCE_MS = 5.0
-"""Largest difference of the stamps of one frame, if none is given [ms]; the sensors of a robot stamp the same instant a few ms apart."""
+"""Largest difference of the stamps of one frame if none is given [ms]; a robot's sensors stamp a few ms apart."""
 MAX_PAIRING_TOLERANCE_MS = 1000.0
 """Largest one: in a second, every tissue has moved."""
 
