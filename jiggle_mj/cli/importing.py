@@ -35,6 +35,7 @@ def import_(
     grasp_radius: float | None = None,
     world: str | None = None,
     clock: Literal["header", "receive"] | None = None,
+    allow_truncated: bool = False,
     overwrite: bool = False,
     allow_outside: bool = False,
     as_json: AsJson = False,
@@ -58,6 +59,7 @@ def import_(
         grasp_radius: of a bag: radius of the grip [m]; 0.002 if left out.
         world: of a bag: coordinate frame that counts as the world, z up; the root of /tf if left out.
         clock: of a bag: whose time a message has, its header's or the recorder's that received it; header if left out.
+        allow_truncated: of a bag: read the complete records of an MCAP file that was cut off.
         overwrite: replace existing files.
         allow_outside: of a folder: read data files outside it where the TOML names them.
         as_json: print a summary to stdout as JSON.
@@ -72,20 +74,27 @@ def import_(
         "grasp_radius": grasp_radius,
         "world": world,
         "clock": clock,
+        "allow_truncated": allow_truncated,
     }
     if is_bag(path):
         if recording is not None:
             raise OptionError(f"--recording describes a folder of points, and {path} is a bag; use --topics.")
         _import_bag(path, out, _settings(topics, options), overwrite=overwrite, as_json=as_json)
         return
-    given = [name for name, value in {"topics": topics, **options}.items() if value not in (None, ())]
+    given = [name for name, value in {"topics": topics, **options}.items() if value not in (None, (), False)]
     if given:
         raise OptionError(f"--{given[0].replace('_', '-')} is for a bag, and {path} is none.")
     _import_folder(path, recording, out, overwrite=overwrite, allow_outside=allow_outside, as_json=as_json)
 
 
 def inspect(
-    path: PathArgument, /, *, topics: Path | None = None, topic: Repeated = (), as_json: AsJson = False
+    path: PathArgument,
+    /,
+    *,
+    topics: Path | None = None,
+    topic: Repeated = (),
+    allow_truncated: bool = False,
+    as_json: AsJson = False,
 ) -> None:
     """Print what is in a bag or a recording: topics, types, rates, frames, spans, and what an estimate lacks.
 
@@ -93,11 +102,12 @@ def inspect(
         path: a bag (.bag, .mcap, .db3, or the folder of a ROS 2 bag), or a recording.
         topics: a map.toml that says what the topics of a bag are for.
         topic: the topic of one role, such as left=/psm/left/image_raw; may be repeated.
+        allow_truncated: read the complete records of an MCAP file that was cut off.
         as_json: print it to stdout as JSON.
     """
     from ..importing.bags.inspection import inspect_bag
 
-    report = inspect_bag(path, _settings(topics, {"topic": topic}))
+    report = inspect_bag(path, _settings(topics, {"topic": topic, "allow_truncated": allow_truncated}))
     heads = ("topic", "type", "messages", "Hz", "from [s]", "to [s]", "frames", "role")
     table = Table(*(Column(head, overflow="fold") for head in heads), box=None)
     for each in report.topics:

@@ -62,13 +62,14 @@ class Bag:
 
     Args:
         path: a `.bag`, `.mcap` or `.db3` file, or the folder of a ROS 2 bag.
+        allow_truncated: read the complete records of an MCAP file that was cut off.
 
     Raises:
         RecordingError: the library rosbags is missing, or the bag is missing, damaged or of an unknown kind.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, *, allow_truncated: bool = False) -> None:
+        self.path, self._allow_truncated = path, allow_truncated
         self._stack = ExitStack()
         with refusing(path):
             files = bag_files(path)
@@ -129,7 +130,7 @@ class Bag:
 
     def _open(self, file: Path) -> "_McapFile | _RosbagsFile":
         if file.suffix == ".mcap":
-            return _McapFile(file)
+            return _McapFile(file, allow_truncated=self._allow_truncated)
         from rosbags import rosbag1, rosbag2
 
         return _RosbagsFile(
@@ -167,8 +168,8 @@ class _RosbagsFile:
 class _McapFile:
     """A single MCAP file, with messages of ROS 2 or ROS 1."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, *, allow_truncated: bool) -> None:
+        self._path, self._allow_truncated = path, allow_truncated
         self._topics: dict[str, BagTopic] | None = None
 
     def topics(self) -> Iterator[BagTopic]:
@@ -190,7 +191,7 @@ class _McapFile:
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         self._seen: dict[str, BagTopic] = {}
-        for record in iterate_records(self._path):
+        for record in iterate_records(self._path, allow_truncated=self._allow_truncated):
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):

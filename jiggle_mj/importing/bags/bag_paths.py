@@ -106,7 +106,9 @@ def refuse_cut_database(path: Path) -> None:
             page_size = int.from_bytes(head[16:18], "big")
             wanted = (65536 if page_size == 1 else page_size) * int.from_bytes(head[28:32], "big")
             if file.stat().st_size < max(wanted, SQLITE_HEADER):
-                raise RecordingError(f"{file} is cut off: {file.stat().st_size} of {wanted} bytes are there.")
+                raise RecordingError(
+                    f"{file} is cut off: {file.stat().st_size} of {wanted} bytes are there; copy it again."
+                )
 
 
 @contextmanager

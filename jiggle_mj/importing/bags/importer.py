@@ -84,7 +84,7 @@ def import_bag(
         raise OutputError(f"{out} exists; choose another path, or allow the file to be replaced (--overwrite).")
     if out.resolve() == bag.resolve() or bag.resolve() in out.resolve().parents:
         raise OutputError(f"{out} is the bag, or lies in it; choose another path.")
-    with Bag(bag) as source:
+    with Bag(bag, allow_truncated=settings.allow_truncated) as source:
         try:
             return _import(source, out, settings)
         except AttributeError as failure:

@@ -78,7 +78,7 @@ def inspect_bag(path: Path, settings: BagSettings | None = None) -> BagReport:
         RecordingError: missing, damaged, or neither.
     """
     settings = settings or BagSettings()
-    with Bag(path) as bag:
+    with Bag(path, allow_truncated=settings.allow_truncated) as bag:
         ours = not any(topic.encoding in ROS_ENCODINGS for topic in bag.topics.values())
         roles: dict[Role, RoleChoice] = {}
         unsure: dict[Role, list[str]] = {}
@@ -96,7 +96,7 @@ def inspect_bag(path: Path, settings: BagSettings | None = None) -> BagReport:
             path=path,
             kind="recording",
             topics=topics,
-            missing=_recording_lacks(path),
+            missing=_recording_lacks(path, allow_truncated=settings.allow_truncated),
             next_command=f"jiggle-mj estimate {path} --out out/estimate",
         )
     missing = missing_roles(roles, unsure, settings)
@@ -153,10 +153,10 @@ def _report(name: str, kind: str, found: _Found, start: int, role: str | None) -
     )
 
 
-def _recording_lacks(path: Path) -> tuple[str, ...]:
+def _recording_lacks(path: Path, *, allow_truncated: bool) -> tuple[str, ...]:
     """Return why a recording cannot be estimated; empty where it can."""
     try:
-        recording = Recording.open(path)
+        recording = Recording.open(path, allow_truncated=allow_truncated)
         usable = sum(1 for _ in recording)
     except RecordingError as failure:
         return (str(failure),)

@@ -31,6 +31,8 @@ def refuse_foreign(bag: Bag) -> None:
     topics = bag.topics.values()
     if any(topic.encoding in ROS_ENCODINGS for topic in topics):
         return
+    if not topics:
+        raise RecordingError(f"{bag.path} is empty: it has no topic; record it again.")
     if POSE in bag.topics and GRASP in bag.topics:
         raise RecordingError(f"{bag.path} is a recording already; use it: jiggle-mj estimate {bag.path} --out DIR.")
     encodings = sorted({f"{topic.type} ({topic.encoding})" for topic in topics})

@@ -68,6 +68,8 @@ class BagSettings:
     """Field of the clouds that numbers the material points; empty for none, None to look for a usual name."""
     noise_sd: float | None = None
     """Standard deviation of each coordinate of the clouds [m]; None for the default of `MeasuredPoints`."""
+    allow_truncated: bool = False
+    """Whether the complete records of an MCAP file that was cut off are read."""
     depth: DepthSettings = DepthSettings()
     """How depth images become clouds."""
     declaration: Declaration | None = None
@@ -133,6 +135,7 @@ def with_options(
     grasp_radius: float | None = None,
     world: str | None = None,
     clock: Clock | None = None,
+    allow_truncated: bool = False,
 ) -> BagSettings:
     """Return settings in which the options of the command line replace those of map.toml.
 
@@ -145,6 +148,7 @@ def with_options(
         grasp_radius: of the grip [m].
         world: frame that counts as the world.
         clock: whose time a message has.
+        allow_truncated: whether the complete records of an MCAP file that was cut off are read.
 
     Raises:
         OptionError: an option is not of that form, or out of range.
@@ -164,7 +168,7 @@ def with_options(
     given |= {"pairing_tolerance_ms": pairing_tolerance, "grasp_radius": grasp_radius}
     given |= {"closed": None if closed is None else ClosedRule.parse(closed)}
     chosen = {name: value for name, value in given.items() if value is not None}
-    return replace(settings, topics=topics, camera_info=files, **chosen)
+    return replace(settings, topics=topics, camera_info=files, allow_truncated=allow_truncated, **chosen)
 
 
 def _pair(text: str, option: str, allowed: Sequence[str]) -> tuple[str, str]:

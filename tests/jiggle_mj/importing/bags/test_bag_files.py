@@ -11,6 +11,7 @@ from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.importing.bags.bag_file import Bag
 from jiggle_mj.importing.bags.bag_paths import is_bag
 from jiggle_mj.importing.bags.importer import import_bag
+from jiggle_mj.importing.bags.settings import BagSettings
 from tests.support.robot_bags import (
     EPOCH,
     STEP,
@@ -171,3 +172,19 @@ def test_an_output_that_exists_is_kept(tmp_path: Path):
 def test_the_clock_of_the_robot_is_in_the_bag_alone(tmp_path: Path):
     with Bag(small_bag(tmp_path / "bag")) as bag:
         assert next(bag.messages(["/tool/pose"])).received == EPOCH
+
+
+def test_a_cut_mcap_is_read_as_far_as_it_goes_where_the_user_allows_it(tmp_path: Path):
+    """rosbags closes a chunk after each MiB; what follows the padding is cut."""
+    with RobotBag(tmp_path / "bag") as bag:
+        bag.cameras(small_camera())
+        write_tool(bag, 80)
+        write_images(bag, 80)
+        bag.write("/padding", 0, "std_msgs/String", data="x" * 2**20)
+        write_images(bag, 40)
+    file = bag.path / "bag.mcap"
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) - 40_000])
+    with pytest.raises(RecordingError, match="--allow-truncated"):
+        import_bag(bag.path, tmp_path / "run.mcap")
+    assert import_bag(bag.path, tmp_path / "run.mcap", BagSettings(allow_truncated=True)).n_frames == 80
