@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ...errors import RecordingError
+from ...errors import JiggleError, RecordingError
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 """Suffixes of the files that a ROS 2 bag consists of."""
@@ -116,11 +116,12 @@ def refusing(path: Path, part: str = "the bag") -> Iterator[None]:
     """Turn what the libraries raise for damaged data into one line.
 
     Catches every Exception on purpose: a damaged bag surfaces as errors of rosbags, apsw, zstandard, lz4, struct, yaml
-    and as bare KeyErrors and assertions, and no list of them is complete.
+    and OpenCV, as bare KeyErrors and assertions, and as fields of another type where a bag defines a type anew. No list
+    of them is complete.
     """
     try:
         yield
-    except RecordingError:
+    except JiggleError:
         raise
     except Exception as failure:
         cure = " 'rosbag reindex' mends a file that was not closed." if path.suffix == ".bag" else ""

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from ...camera import CameraCalibration
 from ...errors import RecordingError
+from .bag_paths import listed
 from .images import depth_image
 from .settings import DepthSettings
 
@@ -94,6 +95,9 @@ def _columns(message: Any) -> dict[str, np.ndarray]:
     if height * width == 0:
         raise RecordingError("is an empty cloud")
     known = [field for field in message.fields if int(field.datatype) in FIELD_TYPES and int(field.count) <= 1]
+    names = [str(field.name) for field in known]
+    if len(set(names)) < len(names) or "" in names:
+        raise RecordingError(f"has fields without a name, or with one name: {listed(names)}")
     formats = [np.dtype(("<", ">")[bool(message.is_bigendian)] + FIELD_TYPES[int(field.datatype)]) for field in known]
     ends = [int(field.offset) + form.itemsize for field, form in zip(known, formats, strict=True)]
     if stride == 0 or max(ends, default=0) > stride or step < width * stride:
@@ -104,7 +108,7 @@ def _columns(message: Any) -> dict[str, np.ndarray]:
         raise RecordingError(f"has {data.size} bytes; {height} rows of {width} points of {stride} bytes need more")
     layout = np.dtype(
         {
-            "names": [str(field.name) for field in known],
+            "names": names,
             "formats": formats,
             "offsets": [int(field.offset) for field in known],
             "itemsize": stride,
@@ -112,7 +116,7 @@ def _columns(message: Any) -> dict[str, np.ndarray]:
     )
     rows = np.lib.stride_tricks.as_strided(data, (height, width * stride), (step, 1), writeable=False)
     table = np.ascontiguousarray(rows).reshape(-1).view(layout)
-    return {str(field.name): table[str(field.name)] for field in known}
+    return {name: table[name] for name in names}
 
 
 def _bounded(positions: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:

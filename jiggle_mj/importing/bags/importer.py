@@ -23,6 +23,7 @@ from ...recording.declaration import identity
 from ...recording.writer import RecordingWriter
 from ..declaration import DEFAULT_GRASP_RADIUS
 from .bag_file import Bag
+from .bag_paths import refusing
 from .camera_order import left_is_left
 from .clouds import cloud_points, depth_points
 from .gripper import state_at
@@ -85,10 +86,8 @@ def import_bag(
     if out.resolve() == bag.resolve() or bag.resolve() in out.resolve().parents:
         raise OutputError(f"{out} is the bag, or lies in it; choose another path.")
     with Bag(bag, allow_truncated=settings.allow_truncated) as source:
-        try:
+        with refusing(bag, "a message"):
             return _import(source, out, settings)
-        except AttributeError as failure:
-            raise RecordingError(f"{bag}: a message lacks a field of its type: {str(failure)[:200]}.") from failure
 
 
 def _import(bag: Bag, out: Path, settings: BagSettings) -> BagSummary:

@@ -13,6 +13,7 @@ import numpy as np
 from ...errors import RecordingError
 from ...recording.reader import Recording
 from .bag_file import ROS_ENCODINGS, Bag
+from .bag_paths import refusing
 from .missing import missing_roles
 from .roles import TF_TYPES, TYPES, RoleChoice, choose_roles
 from .settings import BagSettings, Role
@@ -78,7 +79,7 @@ def inspect_bag(path: Path, settings: BagSettings | None = None) -> BagReport:
         RecordingError: missing, damaged, or neither.
     """
     settings = settings or BagSettings()
-    with Bag(path, allow_truncated=settings.allow_truncated) as bag:
+    with Bag(path, allow_truncated=settings.allow_truncated) as bag, refusing(path, "a message"):
         ours = not any(topic.encoding in ROS_ENCODINGS for topic in bag.topics.values())
         roles: dict[Role, RoleChoice] = {}
         unsure: dict[Role, list[str]] = {}

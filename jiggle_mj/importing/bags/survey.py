@@ -79,6 +79,9 @@ def survey_bag(bag: Bag, roles: dict[Role, RoleChoice], settings: BagSettings) -
                 f"{name}: {of_topic.n_zero} of {len(received[name])} messages have no stamp; its times are those of "
                 "receipt"
             )
+        n_twice = len(of_topic.stamps) - len(of_topic.order)
+        if n_twice and not name.endswith("camera_info"):
+            notes.append(f"{name}: {n_twice} messages have the stamp of an earlier one and are left out")
         times |= {role: of_topic for role in its_roles}
     clocked = [each for role, each in times.items() if role not in ("left_info", "right_info", "depth_info")]
     refuse_two_clocks(clocked)

@@ -63,6 +63,7 @@ def test_unseen_points_are_kept_with_their_number_and_dropped_without():
         ({"point_step": 8}, None, "outside its points"),
         ({"width": 0}, None, "empty cloud"),
         ({"fields": []}, None, "lacks the fields x, y, z"),
+        ({"fields": 2 * [SimpleNamespace(name="x", offset=0, datatype=7, count=1)]}, None, "with one name: x, x"),
     ],
 )
 def test_a_cloud_that_cannot_be_is_named(changes: dict, id_field: str | None, why: str):

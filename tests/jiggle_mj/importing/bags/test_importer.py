@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 from jiggle_mj import Recording
 from jiggle_mj.errors import OutputError, RecordingError
@@ -337,3 +338,16 @@ def test_what_is_assumed_is_said(tmp_path: Path):
     assert next(iter(recording)).tool.radius == 0.002
     given, recording = imported(path, grasp_radius=0.007)
     assert not any("assumed" in note for note in given.notes) and next(iter(recording)).tool.radius == 0.007
+
+
+def test_a_type_that_a_bag_defines_anew_is_one_line(tmp_path: Path):
+    """A std_msgs/Bool whose data is a list of texts, and a pose without a header."""
+
+    def odd(made: RobotBag) -> None:
+        made.store.fielddefs.pop("std_msgs/msg/Bool")
+        made.store.register(get_types_from_msg("string[] data", "std_msgs/msg/Bool"))
+        for index in range(4):
+            made.pose("/tool/pose", index * STEP, [0, 0, 0])
+            made.write("/gripper/closed", index * STEP, "std_msgs/Bool", data=["yes"])
+
+    assert "cannot be read" in refused(bag(tmp_path, cameras, write_images, odd))
