@@ -50,9 +50,10 @@ def read_visibility(
     values = np.asarray(values)
     if values.dtype.kind == "b":
         return values, "true is seen"
+    values = np.nan_to_num(values, nan=0.0) if values.dtype.kind == "f" else values
     if not ((values >= 0) & (values <= 1)).all():
         raise RecordingError(
-            f"{name} holds values from {np.nanmin(values):.3g} to {np.nanmax(values):.3g}; visibility is true or "
+            f"{name} holds values from {values.min():.3g} to {values.max():.3g}; visibility is true or "
             'false, or a probability; for other values give missing = "ARRAY < NUMBER".'
         )
     if set(np.unique(values)) <= {0, 1}:
