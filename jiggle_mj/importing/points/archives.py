@@ -17,12 +17,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 from numpy.lib import format as npy_format
-from scipy.io import loadmat, whosmat
-from scipy.io.matlab import MatReadError
 
 from ...errors import RecordingError
 from ..data_folder import quoted
 from .file_kinds import MAX_POSITION_BYTES, file_kind
+from .mat_files import mat_arrays
 
 DAMAGE = (
     OSError,
@@ -43,18 +42,15 @@ DAMAGE = (
     zlib.error,
     LZMAError,
     zipfile.BadZipFile,
-    MatReadError,
     Warning,
 )
-"""What the readers of numpy, scipy, trimesh and the standard library raise on damaged bytes."""
+"""What the readers of numpy, trimesh and the standard library raise on damaged bytes."""
 HEADER_BYTES = 2**14
 """Length in which an array's header ends; numpy itself reads no longer ones [bytes]."""
 NUMBER_KINDS = "biuf"
 """Kinds of arrays that hold plain numbers: bool, int, unsigned, float."""
 HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
 """Readers of the headers of plain arrays, by the format's version."""
-MAT_HEADER_BYTES, MAT_COMPRESSED, INFLATE_STEP = 128, 15, 2**20
-"""Length of a .mat's header, type of a compressed element, and how much of it is inflated at once [bytes]."""
 MAX_LISTED = 12
 """How many arrays an error lists."""
 
@@ -88,13 +84,13 @@ def read_array(path: Path, key: str | None) -> Shaped[np.ndarray, "..."]:
     with damage_refused(path, f".{kind}"):
         if kind == "npy":
             return _read_npy(path)
-        shapes = _npz_shapes(path) if kind == "npz" else _mat_shapes(path)
+        shapes = _npz_shapes(path) if kind == "npz" else {name: array.shape for name, array in mat_arrays(path)}
         if key not in shapes:
             what = (
                 "needs [points] key, the name of one of its arrays" if key is None else f"has no array '{quoted(key)}'"
             )
             raise RecordingError(f"{path} {what}; it has {describe(shapes)}.")
-        array = _read_npz(path, key) if kind == "npz" else loadmat(path, variable_names=[key])[key]
+        array = _read_npz(path, key) if kind == "npz" else _read_mat(path, key)
     if array.dtype.kind not in NUMBER_KINDS:
         raise RecordingError(f"{path}: {key} holds {array.dtype}, not plain numbers.")
     return array
@@ -110,7 +106,7 @@ def array_shapes(path: Path) -> dict[str, tuple[int, ...]]:
     if kind not in ("npz", "mat"):
         return {}
     with damage_refused(path, f".{kind}"):
-        return _npz_shapes(path) if kind == "npz" else _mat_shapes(path)
+        return _npz_shapes(path) if kind == "npz" else {name: array.shape for name, array in mat_arrays(path)}
 
 
 def describe(shapes: dict[str, tuple[int, ...]]) -> str:
@@ -138,6 +134,12 @@ def _read_npz(path: Path, key: str) -> Shaped[np.ndarray, "..."]:
             _refuse_large(path, key, stream.read(HEADER_BYTES), info.file_size)
         with archive.open(info) as stream:
             return npy_format.read_array(stream, allow_pickle=False)
+
+
+def _read_mat(path: Path, key: str) -> Shaped[np.ndarray, "..."]:
+    """Return an array of a .mat; a row or a column, as MATLAB has instead of a vector, as a vector."""
+    array = next(array for name, array in mat_arrays(path) if name == key)
+    return array.ravel() if array.ndim == 2 and 1 in array.shape else array
 
 
 def _read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
@@ -178,25 +180,3 @@ def _header(head: bytes) -> tuple[tuple[int, ...], np.dtype] | None:
     except ValueError:
         return None
     return (shape, dtype) if dtype.kind in NUMBER_KINDS and all(length >= 0 for length in shape) else None
-
-
-def _mat_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    _refuse_inflated(path)
-    numeric = {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
-    return {name: tuple(shape) for name, shape, kind in whosmat(path) if kind in numeric}
-
-
-def _refuse_inflated(path: Path) -> None:
-    """Refuse a .mat whose compressed elements hold more than the positions of a recording may."""
-    data = path.read_bytes()
-    order = ">" if data[126:128] == b"MI" else "<"
-    place, total = MAT_HEADER_BYTES, 0
-    while place + 8 <= len(data):
-        kind, length = struct.unpack(f"{order}II", data[place : place + 8])
-        rest, inflater = data[place + 8 : place + 8 + length], zlib.decompressobj()
-        place += 8 + length
-        while kind == MAT_COMPRESSED and rest:
-            total += len(inflater.decompress(rest, INFLATE_STEP))
-            rest = inflater.unconsumed_tail
-            if total > MAX_POSITION_BYTES:
-                raise RecordingError(f"{path} holds more than {MAX_POSITION_BYTES} bytes once unpacked: split it.")

@@ -10,8 +10,8 @@ from ..data_folder import quoted
 FileKind = Literal["text", "npz", "npy", "mat", "ply", "obj", "pcd"]
 HEAD_BYTES = 4096
 """Bytes of a file's beginning that tell its kind."""
-MAX_FILE_BYTES = 2**30
-"""Size above which a file is refused [bytes]: several times what the largest accepted positions need."""
+MAX_FILE_BYTES = 2**28
+"""Size above which a file is refused [bytes]: twice what the largest accepted positions need."""
 MAX_POSITION_BYTES = 2**27
 """Size above which positions are refused [bytes of 64-bit floats]: 5.6 million points, summed over the frames, of which
 an import holds a few copies."""
