@@ -85,7 +85,7 @@ def read_array(path: Path, key: str | None) -> Shaped[np.ndarray, "..."]:
         if kind == "npy":
             return _read_npy(path)
         shapes = _npz_shapes(path) if kind == "npz" else {name: array.shape for name, array in mat_arrays(path)}
-        if key not in shapes:
+        if key is None or key not in shapes:
             what = (
                 "needs [points] key, the name of one of its arrays" if key is None else f"has no array '{quoted(key)}'"
             )
