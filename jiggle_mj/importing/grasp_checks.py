@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ..errors import RecordingError
 from .clock import FrameClock
 from .declaration import MeasuredRecording
-from .grasps import Grasp
+from .grasps import GraspSpan
 from .reports import Reports
 from .units import LENGTH_UNITS, PREFERRED_UNITS
 
@@ -30,7 +30,7 @@ N_LEADERS = 4
 def refuse_wrong_grasps(
     given: MeasuredRecording,
     frames: Float[np.ndarray, "t n 3"],
-    grasps: tuple[Grasp, ...],
+    grasps: tuple[GraspSpan, ...],
     reports: Reports | None,
     clock: FrameClock,
 ) -> None:
@@ -58,7 +58,7 @@ def refuse_wrong_grasps(
 def _refuse_far(
     given: MeasuredRecording,
     frames: Float[np.ndarray, "t n 3"],
-    grasp: Grasp,
+    grasp: GraspSpan,
     reports: Reports,
     clock: FrameClock,
 ) -> None:
@@ -93,7 +93,7 @@ def _refuse_far(
 def _refuse_still(
     given: MeasuredRecording,
     frames: Float[np.ndarray, "t n 3"],
-    grasp: Grasp,
+    grasp: GraspSpan,
     reports: Reports | None,
     clock: FrameClock,
     several: bool,

@@ -17,7 +17,7 @@ from .reports import Reports
 
 
 @dataclass(frozen=True, kw_only=True)
-class Grasp:
+class GraspSpan:
     """One grasp: consecutive frames of one run under one table of recording.toml."""
 
     number: int
@@ -48,7 +48,7 @@ def read_grasps(
     clock: FrameClock,
     reports: Reports | None,
     vertices: Float[np.ndarray, "v 3"] | None,
-) -> tuple[Grasp, ...]:
+) -> tuple[GraspSpan, ...]:
     """Return the grasps in the order of time.
 
     Args:
@@ -80,7 +80,7 @@ def read_grasps(
                 "one grasp: change run, begin and end, or frames."
             )
         cover[inside] = index
-    grasps: list[Grasp] = []
+    grasps: list[GraspSpan] = []
     for begin, end in _stretches(cover, np.array(clock.runs)):
         table = tables[cover[begin]]
         run = f", run {clock.run_values[begin]}" if len(set(clock.runs)) > 1 else ""
@@ -90,7 +90,9 @@ def read_grasps(
             held = _held(folder, table, frames, closing, names, clock, reports, vertices)
         number = len(grasps) + 1
         grasps.append(
-            Grasp(number=number, what=table.where + run, given=table, frames=(begin, end), closing=closing, held=held)
+            GraspSpan(
+                number=number, what=table.where + run, given=table, frames=(begin, end), closing=closing, held=held
+            )
         )
     _refuse_open(grasps, clock)
     return tuple(grasps)
@@ -117,7 +119,7 @@ def _closing(table: GivenGrasp, clock: FrameClock, begin: int, end: int) -> int 
     return next((k for k in range(begin, end) if clock.times[k] - clock.times[begin] >= after), None)
 
 
-def _refuse_open(grasps: list[Grasp], clock: FrameClock) -> None:
+def _refuse_open(grasps: list[GraspSpan], clock: FrameClock) -> None:
     for grasp in grasps:
         if grasp.closing is None:
             begin, end = grasp.frames

@@ -134,7 +134,7 @@ def _mesh_lines(arrays: GuessedArrays) -> list[str]:
 
 def _grasp_lines(folder: Path, points: GuessedPoints, arrays: GuessedArrays) -> list[str]:
     file = _rows_file(folder, points.positions.shape[1], HELD_FILE)
-    frames = np.flatnonzero(np.isfinite(points.positions).all(axis=2).any(axis=1))
+    frames = [k for k, each in enumerate(points.positions) if np.isfinite(each).all(axis=1).any()]
     runs = np.zeros(len(points.positions), int)
     if arrays.runs is not None:
         runs = read_array(folder / points.files.files[0], arrays.runs)

@@ -60,7 +60,7 @@ def guess_noise(frames: Float[np.ndarray, "t n 3"]) -> float:
 def _rough(frames: Float[np.ndarray, "t n c"]) -> float:
     seen = np.flatnonzero(np.isfinite(frames[0]).all(axis=1))
     k = min(N_NEIGHBOURS, len(seen) - 1)
-    near = KDTree(frames[0][seen]).query(frames[0][seen], k=k + 1)[1][:, 1:]
+    near = np.asarray(KDTree(frames[0][seen]).query(frames[0][seen], k=k + 1)[1])[:, 1:]
     moved = (frames - frames[0])[1:, seen]
     stray = moved - moved[:, near].mean(axis=2)
     # A displacement holds the noise of two frames, and the neighbours' mean adds a k-th.

@@ -10,7 +10,7 @@ from .clock import FrameClock
 from .data_folder import DataFolder
 from .declaration import MeasuredRecording
 from .grasp_checks import refuse_wrong_grasps
-from .grasps import Grasp, read_grasps
+from .grasps import GraspSpan, read_grasps
 from .reports import Reports, read_reports
 
 
@@ -26,7 +26,7 @@ class Tool:
     """Number of each frame, counted from the rest frame."""
     clock: FrameClock
     """Times and runs of the frames."""
-    grasps: tuple[Grasp, ...]
+    grasps: tuple[GraspSpan, ...]
     """The grasps; none on a path."""
     reports: Reports | None
     """Reports of the instrument; None where it has none."""
@@ -59,7 +59,7 @@ class Tool:
                 does not hold the named points.
         """
         reports = None if given.grasp.tool is None else read_reports(folder, given, given.grasp.tool, clock)
-        grasps: tuple[Grasp, ...] = ()
+        grasps: tuple[GraspSpan, ...] = ()
         if given.grasp.path is None:
             numbers = [step + given.points.rest for step in steps]
             grasps = read_grasps(
@@ -142,7 +142,7 @@ class Tool:
         number = grasp.number if closed or ended else grasp.number - 1
         return closed, number, grasp.given.radius, tuple(grasp.held.tolist())
 
-    def _grasp(self, frame: int) -> Grasp:
+    def _grasp(self, frame: int) -> GraspSpan:
         """Return the grasp of a frame, the next one where the jaws are open, or the last."""
         return next((grasp for grasp in self.grasps if frame < grasp.frames[1]), self.grasps[-1])
 

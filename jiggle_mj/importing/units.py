@@ -9,7 +9,7 @@ from ..toml_kinds import REQUIRED, StrictTable
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 """Metres in one unit of length."""
 PREFERRED_UNITS = ("m", "mm", "cm", "um")
-"""Units of length in the order in which they are tried as a cure: cm are rare, and um fit any place near 0."""
+"""Units of length in the order in which they are tried: cm are rare in exports, and um fit any place near 0."""
 TIME_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Nanoseconds in one unit of time."""
 
