@@ -162,6 +162,11 @@ def _frames_in_world(
 def _refuse_extent(rest: Float[np.ndarray, "n 3"], given: MeasuredRecording) -> None:
     extent = float(np.ptp(rest[np.isfinite(rest).all(axis=1)], axis=0).max())
     if MIN_EXTENT <= extent <= MAX_EXTENT:
+        if given.noise_sd > MAX_NOISE_SHARE * extent:
+            raise RecordingError(
+                f"noise_sd is {given.noise_sd:.3g} m, and the sheet is {extent:.3g} m large: it is in metres, not in "
+                f"unit; at most {MAX_NOISE_SHARE:.0%} of the sheet is allowed."
+            )
         return
     likely = likely_unit(extent / given.unit, LENGTH_UNITS, *LIKELY_EXTENT)
     cure = "check unit and columns" if likely is None else f'is it unit = "{likely}"?'
