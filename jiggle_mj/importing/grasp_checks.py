@@ -21,8 +21,9 @@ MOTION_NOISE = 20
 """The same as a multiple of the declared noise."""
 STILL_SHARE = 0.2
 """Share of the leading displacement below which a point stands still: grasped skin and cloth follow by 0.4 to 1."""
-MAX_STILL = 0.25
-"""Share of the held points that may stand still: a slip of some, not the points of another corner."""
+STILL_REFUSED = 0.5
+"""Share of the held points that stand still from which they are refused: with fewer, some slip or are lost; half are
+those of another corner."""
 N_LEADERS = 4
 """Points that must move alike to lead: fewer are a tracker's jumps."""
 
@@ -44,7 +45,7 @@ def refuse_wrong_grasps(
         clock: times of the frames.
 
     Raises:
-        RecordingError: a tool is farther from the nearest held point than the sheet is large, or more than a quarter
+        RecordingError: a tool is farther from the nearest held point than the sheet is large, or half
             of the held points stand still while the tool, or the rest of them, moves by centimetres.
     """
     for grasp in grasps:
@@ -114,7 +115,7 @@ def _refuse_still(
     share = moved[at][grasp.held] @ leading[at] / far[at] ** 2
     share = share[np.isfinite(share)]
     still = int((share < STILL_SHARE).sum())
-    if not len(share) or still <= MAX_STILL * len(share):
+    if not len(share) or still < STILL_REFUSED * len(share):
         return
     cure = (
         "give each pull its own [[grasp]] with its rows, or at and radius, and run, begin and end, or frames"

@@ -135,6 +135,12 @@ def read_grasps(top: StrictTable) -> GraspTable:
     for table, grasp in zip(tables, grasps, strict=True):
         table.known |= {*TOOL_KEYS, *PATH_KEYS}
         table.refuse_unknown()
+        path_key = next((key for key in PATH_KEYS if key in table.values), None)
+        if path_key is not None:
+            raise RecordingError(
+                f"{table.where} {path_key} is that of a straight pull, which has start, direction and step in the one "
+                "[grasp], and no held points."
+            )
         if len(tables) > 1 and grasp.covers_all:
             raise RecordingError(
                 f"{table.where} needs run, begin and end, or frames: there are {len(tables)} grasps, and each needs "
@@ -173,7 +179,7 @@ def _grasp(table: StrictTable) -> GivenGrasp:
     grasp = GivenGrasp(
         held=_held(table),
         radius=table.take("radius", kinds.positive, DEFAULT_GRASP_RADIUS),
-        after=table.take("after", kinds.number, 0.0),
+        after=table.take("after", _not_negative, 0.0),
         run=table.take("run", _integer, None),
         begin=table.take("begin", kinds.number, None),
         end=table.take("end", kinds.number, None),
@@ -248,6 +254,16 @@ def _offset(value: Any) -> float | None:
         return kinds.number(value)
     except TypeError as failure:
         raise TypeError(f'a number [s], or "{START_TOGETHER}"') from failure
+
+
+def _not_negative(value: Any) -> float:
+    try:
+        number = kinds.number(value)
+    except TypeError as failure:
+        raise TypeError("a number from 0") from failure
+    if number < 0:
+        raise TypeError("a number from 0")
+    return number
 
 
 def _integer(value: Any) -> int:

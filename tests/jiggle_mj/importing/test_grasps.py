@@ -97,6 +97,8 @@ def test_one_list_for_pulls_at_two_corners_is_refused_with_the_cure(tmp_path, to
         (TOOL, "at = [0.2, 0.2, 0.0]\nradius = 1e-3", r"holds nothing: .* the nearest is 212 mm away"),
         ("", 'rows = "near tool"\nradius = 8e-3', "needs tool"),
         (TOOL, 'rows = "near tool"', "needs radius"),
+        (TOOL, "rows = [28, 29]\nafter = -1.0", "after must be a number from 0"),
+        (TOOL, "rows = [28, 29]\nstep = 1e-3", "step is that of a straight pull"),
         (TOOL, "rows = [28, 29]\nafter = 5.0", "the jaws never close: after is 5 s"),
         (TOOL + '\ntool_unit = "m"', "rows = [28, 29]", 'the tool is 7.* m from the nearest.*tool_unit = "mm"'),
         (TOOL + "\ntool_clock_offset = 60", "rows = [28, 29]", 'do not overlap.*tool_clock_offset.*-60, or "start'),
@@ -115,10 +117,11 @@ def test_what_is_wrong_with_a_grasp_is_named(tmp_path, tool, second, message):
         ("run = 9", "run = 7", "both cover d.npz frame 0"),
         ("run = 9", "", "needs run, begin and end, or frames: there are 2 grasps"),
         ("run = 9", "run = 9\nbegin = 1.0", "has several of run, begin and end, and frames"),
+        ("noise_sd = 1e-4", "noise_sd = 0.1", "noise_sd is 0.1 m, and the sheet is 0.05 m large"),
         ("run = 9", "frames = [3, 1]", "frames must be two whole numbers"),
     ],
 )
-def test_grasps_that_cover_no_frame_or_the_same_are_refused(tmp_path, old, new, message):
+def test_grasps_that_cover_no_frame_or_the_same_and_large_noise_are_refused(tmp_path, old, new, message):
     toml = TWO_PULLS.format(first=TOOL, second="rows = [28, 29, 34, 35]").replace(old, new)
     with pytest.raises(RecordingError, match=message):
         bring_in(two_pulls(tmp_path, toml))
