@@ -1,4 +1,26 @@
-"""Ranges of settings, which every config of the estimator checks alike."""
+"""Ranges of settings, which every config of the estimator checks alike, and the largest number of particles."""
+
+from jiggle_mj.errors import PerceptionError
+
+MAX_PARTICLES = 20_000
+"""Most particles of a sheet: the belief of more, a square matrix, does not fit a few GB."""
+
+
+def refuse_many_particles(n: float, cause: str) -> None:
+    """Refuse a sheet of more than `MAX_PARTICLES` particles.
+
+    Args:
+        n: number of particles, or an estimate of it.
+        cause: what gives so many, for the message.
+
+    Raises:
+        PerceptionError: there are more.
+    """
+    if n > MAX_PARTICLES:
+        raise PerceptionError(
+            f"{cause} gives {n:.3g} particles; at most {MAX_PARTICLES} can be estimated. Is a length in another unit "
+            "(baseline, points, EstimatorConfig.spacing), or the spacing too small?"
+        )
 
 
 def check_ranges(config: object, *, positive: tuple[str, ...], shares: tuple[str, ...] = ()) -> None:

@@ -32,8 +32,8 @@ def refuse_grey(image: UInt8[np.ndarray, "height width 3"]) -> None:
     """
     if (image[..., 0] == image[..., 1]).all() and (image[..., 1] == image[..., 2]).all():
         raise MaskError(
-            "the images are grey, and tissue is found by its colour; say which pixels are tissue with --mask "
-            "(or Estimator's mask).",
+            "no tissue can be found by its colour: the images are grey. Say which pixels are tissue with --mask (or "
+            "Estimator's mask).",
             np.zeros(image.shape[:2], bool),
         )
 

@@ -15,6 +15,7 @@ from jiggle_mj.estimate import Sheet
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair
 
 from ..physics.environment import Grip
+from ..ranges import refuse_many_particles
 from .cloud_tracker import CloudTracker, lay_mesh
 from .config import PerceptionConfig
 from .disparity import Disparity
@@ -174,13 +175,16 @@ class Perception:
     def _sheet_of_points(self) -> Sheet:
         """Return the sheet at rest of points or clouds, and choose their tracker."""
         if all(points.track_id is not None for points in self._still):
-            return self._points.start(self._still)
+            sheet = self._points.start(self._still)
+            refuse_many_particles(len(sheet.rest), "one particle for each point")
+            return sheet
         declared = self._declaration.mesh
         sheet = (
             lay_mesh(self._still, spacing=self._spacing, config=self._config.clouds)
             if declared is None
             else Sheet(rest=declared.vertices, faces=declared.faces)
         )
+        refuse_many_particles(len(sheet.rest), f"a mesh over the clouds at a spacing of {self._spacing * 1e3:g} mm")
         self._clouds = CloudTracker(sheet, self._declaration, self._config.clouds)
         return sheet
 

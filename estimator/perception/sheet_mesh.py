@@ -17,6 +17,7 @@ from scipy.spatial import Delaunay
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import PerceptionError
 
+from ..ranges import refuse_many_particles
 from .config import SheetMeshConfig
 from .tissue_mask import MAX_SECOND_BLOB
 
@@ -74,7 +75,7 @@ def lay_mesh(
         config: settings of the mesh; the defaults if None.
 
     Raises:
-        PerceptionError: no disparity on the tissue, too few particles, or a mesh in several pieces.
+        PerceptionError: no disparity on the tissue, too few or too many particles, or a mesh in several pieces.
     """
     config = config or SheetMeshConfig()
     surface = surface_through(mask, disparity, config)
@@ -85,6 +86,7 @@ def lay_mesh(
 
     pixel = _pixel_size(cloud, camera)
     outline = _outline(mask, config.inset * spacing / pixel, frame)
+    _refuse_fine(outline, spacing)
     rim = _resample(outline, spacing, tolerance=CORNER_TOLERANCE * spacing)
     inner = _lattice(outline, spacing)
     flat = np.concatenate([rim, inner])
@@ -238,6 +240,17 @@ def _outline(mask: Bool[np.ndarray, "height width"], inset: float, frame: _Plane
         )
     contour = largest[:, 0, :].astype(float) - 1
     return frame.from_image(contour)
+
+
+def _refuse_fine(outline: Float[np.ndarray, "m 2"], spacing: float) -> None:
+    """Refuse a spacing [m] that would give more particles than can be estimated, before any is made."""
+    x, y = outline.T
+    area = abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    size = " x ".join(f"{side:.3g}" for side in high - low)
+    refuse_many_particles(
+        area / (spacing**2 * np.sqrt(3) / 2), f"a sheet of {size} m at a spacing of {spacing * 1e3:g} mm"
+    )
 
 
 def _resample(outline: Float[np.ndarray, "m 2"], spacing: float, *, tolerance: float) -> Float[np.ndarray, "k 2"]:

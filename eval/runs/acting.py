@@ -24,6 +24,8 @@ MAX_STEPS = 40
 """Most actions of a policy if no number is given."""
 MAX_PROCEDURE_STEPS = 400
 """Most actions of a policy that cuts or sews: it looks again after each act."""
+LARGEST_STEPS = 100_000
+"""Largest number that can be given: at a second an action, more than a day."""
 
 
 def policy_named(name: str | None, scene: "Scene", *, seed: int) -> Policy | None:
@@ -130,6 +132,8 @@ def most_actions(scene: "Scene", name: str | None, steps: int | None = None) -> 
 def _max_steps(policy: Policy, steps: int | None) -> int:
     if steps is not None and steps < 1:
         raise OptionError(f"steps = {steps}: must be at least 1.")
+    if steps is not None and steps > LARGEST_STEPS:
+        raise OptionError(f"steps = {steps}: must be at most {LARGEST_STEPS}.")
     return steps or (MAX_PROCEDURE_STEPS if isinstance(policy, ProcedurePolicy) else MAX_STEPS)
 
 

@@ -9,31 +9,32 @@ from rich.table import Table
 from ..errors import RecordingError
 from ..plausibility.problems import metres, problems, seconds
 from ..plausibility.survey import Survey, survey
+from ..recording.mcap_files import truth_path
 from ..recording.reader import Recording
 from .terminal import console
 
 
-def check(recording: Recording, path: Path, *, allow_implausible: bool = False) -> Survey:
-    """Print what is doubtful about a recording, and what is assumed of it; return its survey.
+def report(surveyed: Survey, path: Path, *, allow_implausible: bool = False, cure: str = "") -> None:
+    """Print what is doubtful about a recording.
 
     Args:
-        recording: an open recording.
+        surveyed: its survey.
         path: its file, for messages.
         allow_implausible: print what refuses it, and go on.
+        cure: ends the message of a refusal.
 
     Raises:
         RecordingError: the recording is implausible; names every reason.
     """
-    surveyed = survey(recording)
     found = problems(surveyed)
     for problem in found:
         if not problem.refuses or allow_implausible:
-            _line(f"{problem.name}: {problem.text}")
+            text = f"{problem.name}: {problem.text}"
+            console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
     refused = [] if allow_implausible else [problem for problem in found if problem.refuses]
     if refused:
         reasons = " ".join(f"{problem.name}: {problem.text}" for problem in refused)
-        raise RecordingError(f"{path} is implausible. {reasons} (--allow-implausible goes on nevertheless)")
-    return surveyed
+        raise RecordingError(f"{path} is implausible. {reasons}{cure}")
 
 
 def check_before(recording: Recording, path: Path, declare: Mapping[str, Any], *, allow_implausible: bool) -> None:
@@ -43,21 +44,24 @@ def check_before(recording: Recording, path: Path, declare: Mapping[str, Any], *
         recording: an open recording.
         path: its file, for messages.
         declare: properties that the command line declares.
-        allow_implausible: see `check`.
+        allow_implausible: see `report`.
 
     Raises:
         RecordingError: the recording is implausible.
     """
     from jiggle_mj.eval.runs.settings_used import assumed
 
-    check(recording, path, allow_implausible=allow_implausible)
+    cure = " (--allow-implausible goes on nevertheless)"
+    report(survey(recording), path, allow_implausible=allow_implausible, cure=cure)
     assumption = assumed(recording.declaration, declare=declare, declared=recording.declared)
     if assumption is not None:
         console.print(assumption, style="bold yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 def show_survey(path: Path) -> Survey:
-    """Print the survey of a recording as a table, then its problems, as `check` does.
+    """Print the survey of a recording that was just imported as a table, then what is doubtful about it.
+
+    An implausible recording is removed, with its truth.
 
     Raises:
         RecordingError: the recording cannot be read, or is implausible.
@@ -68,7 +72,13 @@ def show_survey(path: Path) -> Survey:
     for name, value in rows(surveyed):
         table.add_row(name, value)
     console.print(table)
-    return check(recording, path)
+    try:
+        report(surveyed, path)
+    except RecordingError:
+        for written in (path, truth_path(path)):
+            written.unlink(missing_ok=True)
+        raise
+    return surveyed
 
 
 def rows(surveyed: Survey) -> Iterator[tuple[str, str]]:
@@ -103,7 +113,3 @@ def rows(surveyed: Survey) -> Iterator[tuple[str, str]]:
         yield "largest speed of the tool", f"{surveyed.tool_speed_m_s:.3g} m/s"
     if surveyed.image_size is not None:
         yield "images", f"{surveyed.image_size[0]} x {surveyed.image_size[1]} px"
-
-
-def _line(text: str) -> None:
-    console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -8,7 +8,13 @@ KEYS = {
         "by_dilation": BY_DILATION,
         "observable": {"by_dilation": BY_DILATION},
     },
-    "settings": None,
+    "settings": {
+        "declaration": {
+            name: dict.fromkeys(("value", "from"))
+            for name in ("membrane_stiffness", "poisson", "thickness", "areal_density", "gravity", "bed")
+        },
+        "estimator": {},
+    },
     "noise": dict.fromkeys(("force_sd_ratio", "position_sd_ratio")),
     "calibration": dict.fromkeys(("nees_per_dof", "nees_attached", "coverage_90", "coverage_attached", "ece")),
     "tracking": {"rms_m": None},

@@ -1,0 +1,92 @@
+"""Masks from files, and the refusal of a colour mask in doubt."""
+
+import cv2
+import numpy as np
+import pytest
+
+from jiggle_mj.errors import MaskError, OptionError, PerceptionError
+from jiggle_mj.estimator.perception import GrabCut, StereoTracker
+from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
+from jiggle_mj.observation import StereoPair
+from tests.support.perception_plane import HEIGHT, WIDTH, PlaneSheet, camera, stereo
+from tests.support.recordings import tool
+
+WOOD, SHEET = (150, 95, 60), (235, 232, 228)
+"""Colours of a table and of a pale sheet, RGB."""
+MIN_OVERLAP = 0.95
+"""Least intersection over union of GrabCut with a rectangle: its border of one pixel is 4 % of the rectangle."""
+
+
+def table_with_a_sheet(*, at_border: bool = False):
+    """Return a picture of wood with a pale sheet, and the pixels of the sheet."""
+    noise = np.random.default_rng(0).normal(scale=3, size=(HEIGHT, WIDTH, 3))
+    sheet = np.zeros((HEIGHT, WIDTH), bool)
+    sheet[90 - 90 * at_border : 210, 130:270] = True
+    picture = np.where(sheet[..., None], SHEET, WOOD) + noise
+    return picture.clip(0, 255).astype(np.uint8), sheet
+
+
+@pytest.mark.parametrize("at_border", [False, True])
+def test_a_table_is_not_taken_for_the_sheet(tmp_path, at_border):
+    picture, sheet = table_with_a_sheet(at_border=at_border)
+    with pytest.raises(PerceptionError, match="Is it the table") as refused, mask_shown(tmp_path / "out"):
+        StereoTracker(camera()).start(StereoPair(left=picture, right=picture), tool())
+    shown = cv2.imread(str(tmp_path / "out" / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    assert shown is not None
+    assert "mask.png" in str(refused.value)
+    assert (shown > 0)[:5, :5].all()
+    assert not (shown > 0)[150, 200]
+    found = GrabCut()(picture)
+    if not at_border:  # GrabCut's rectangle leaves the border out
+        assert (found & sheet).sum() / (found | sheet).sum() > MIN_OVERLAP
+
+
+def test_a_red_sheet_on_a_bed_is_not_doubted():
+    assert len(StereoTracker(camera()).start(stereo(PlaneSheet()), tool()).rest) > 0
+
+
+def test_grey_images_need_a_mask(tmp_path):
+    pair = stereo(PlaneSheet())
+    left, right = (np.repeat(side[..., :1], 3, axis=2) for side in (pair.left, pair.right))
+    grey = StereoPair(left=left, right=right)
+    with pytest.raises(MaskError, match="images are grey"):
+        StereoTracker(camera()).start(grey, tool())
+    inside = np.zeros((HEIGHT, WIDTH), np.uint8)
+    inside[65:235, 115:285] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), inside)
+    np.save(tmp_path / "mask.npy", inside > 0)
+    np.savez(tmp_path / "mask.npz", left=inside[None] > 0, right=inside[None] > 0)
+    (tmp_path / "all").mkdir()
+    for side in ("left", "right"):
+        cv2.imwrite(str(tmp_path / "all" / f"{side}_000000.png"), inside)
+    sheets = [
+        StereoTracker(camera(), mask=mask_named(str(tmp_path / name))).start(grey, tool())
+        for name in ("mask.png", "mask.npy", "mask.npz", "all")
+    ]
+    for sheet in sheets[1:]:
+        np.testing.assert_array_equal(sheet.rest.shape, sheets[0].rest.shape)
+
+
+def test_a_mask_that_cannot_be_used_is_refused_by_name(tmp_path):
+    (tmp_path / "text.png").write_text("no image")
+    np.savez(tmp_path / "one.npz", left=np.zeros((1, 2, 2), bool))
+    np.save(tmp_path / "line.npy", np.zeros(3))
+    (tmp_path / "empty").mkdir()
+    for name, why in (
+        ("none.png", "no such file"),
+        ("text.png", "is no image"),
+        ("one.npz", "lacks the array 'right'"),
+        ("line.npy", "must be \\(height, width\\)"),
+        ("empty", "left_000000.png"),
+    ):
+        with pytest.raises(OptionError, match=why):
+            mask_named(str(tmp_path / name))
+    cv2.imwrite(str(tmp_path / "small.png"), np.full((10, 10), 255, np.uint8))
+    with pytest.raises(PerceptionError, match="10x10 px and the image"):
+        StereoTracker(camera(), mask=mask_named(str(tmp_path / "small.png"))).start(stereo(PlaneSheet()), tool())
+
+
+def test_a_spacing_that_would_give_too_many_particles_is_refused():
+    """A sheet of 5 cm at 0.1 mm has about 290 000 particles."""
+    with pytest.raises(PerceptionError, match="at most 20000 can be estimated"):
+        StereoTracker(camera(), spacing=1e-4).start(stereo(PlaneSheet()), tool())
