@@ -73,7 +73,7 @@ def _changed(config: T, table: Mapping[str, Any], *, where: str, prefix: str, kn
         else:
             changes[key] = _typed(value, kinds[key], f"{where}: {name}")
     try:
-        return replace(config, **changes)  # pyright: ignore[reportType]
+        return replace(config, **changes)  # pyright: ignore[reportArgumentType]
     except (ValueError, TypeError) as failure:
         raise OptionError(f"{where}: {failure}") from failure
 

@@ -3,9 +3,11 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from ..errors import OptionError
 from ..options import FilterName, PolicyName, Sensing
 from .options import (
     AS_DECLARED,
@@ -15,6 +17,7 @@ from .options import (
     Name,
     Out,
     PathArgument,
+    RecordingOptions,
     RecordingSettings,
     Settings,
     in_ns,
@@ -22,6 +25,11 @@ from .options import (
 from .settings import configured, declared
 from .survey import check_before
 from .terminal import INTERRUPTED, console, deferred_interrupt, progress, show, stop
+
+if TYPE_CHECKING:
+    from jiggle_mj.estimator.perception import FrameMask, TissueMask
+
+    from ..recording.reader import Recording
 
 
 def run(
@@ -113,14 +121,14 @@ def estimate(
         as_json: print result.json to stdout.
     """
     from jiggle_mj.eval.runs.experiment import run_estimator
-    from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
+    from jiggle_mj.eval.runs.mask_files import mask_shown
 
     from ..recording.reader import Recording
 
     config, declare = configured(settings.config, settings.set, estimator), declared(settings.declare)
-    mask = None if settings.mask is None else mask_named(settings.mask)
     tolerance_ns = in_ns(settings.pairing_tolerance)
     source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
+    mask = _mask(settings, source)
     check_before(source, recording, declare, allow_implausible=settings.allow_implausible)
     with mask_shown(out), progress(len(source), f"estimate {recording.name}") as on_frame:
         figures = run_estimator(
@@ -154,16 +162,16 @@ def identify(
         as_json: print the ratios, the refusals and the resulting declaration to stdout as JSON.
     """
     from jiggle_mj.estimator import Estimator
-    from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
+    from jiggle_mj.eval.runs.mask_files import mask_shown
     from jiggle_mj.eval.runs.settings_used import with_declared
 
     from .. import episode
     from ..recording.reader import Recording
 
     config, declare = configured(settings.config, settings.set, "implicit"), declared(settings.declare)
-    mask = None if settings.mask is None else mask_named(settings.mask)
     tolerance_ns = in_ns(settings.pairing_tolerance)
     source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
+    mask = _mask(settings, source)
     check_before(source, recording, declare, allow_implausible=settings.allow_implausible)
     estimator = Estimator(with_declared(source.declaration, declare), source.camera, config=config, mask=mask)
     with mask_shown(Path()), progress(len(source), f"estimate {recording.name}") as on_frame:
@@ -219,14 +227,14 @@ def close_loop(
     from jiggle_mj.eval.report.discrepancy_page import story
     from jiggle_mj.eval.runs.closing_the_loop import PAGE
     from jiggle_mj.eval.runs.closing_the_loop import close_loop as close
-    from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
+    from jiggle_mj.eval.runs.mask_files import mask_shown
 
     from ..recording.reader import Recording
 
     config, declare = configured(settings.config, settings.set, "implicit"), declared(settings.declare)
-    mask = None if settings.mask is None else mask_named(settings.mask)
     tolerance_ns = in_ns(settings.pairing_tolerance)
     source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
+    mask = _mask(settings, source)
     check_before(source, recording, declare, allow_implausible=settings.allow_implausible)
     with mask_shown(out), progress(len(source), f"follow {recording.name}") as on_frame:
         discrepancy = close(
@@ -274,3 +282,16 @@ def score(
 
     figures = score_directory(directory, truth, recording=recording, allow_truncated=allow_truncated, log=console.print)
     show(figures, directory, as_json)
+
+
+def _mask(settings: RecordingOptions, source: "Recording") -> "TissueMask | FrameMask | None":
+    """Return the mask that the options name; None without one.
+
+    Raises:
+        OptionError: it cannot be read, or the recording has no images.
+    """
+    from jiggle_mj.eval.runs.mask_files import mask_named
+
+    if settings.mask is not None and source.camera is None:
+        raise OptionError(f"--mask {settings.mask}: the recording has no images; leave it out.")
+    return None if settings.mask is None else mask_named(settings.mask)

@@ -5,7 +5,7 @@ Both are robust: the median absolute deviation, scaled to the standard deviation
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 MAD_TO_SD = 1.4826
 """Standard deviation of a normal distribution [median absolute deviation]."""
@@ -50,7 +50,7 @@ class NeighbourNoise:
         if len(seen) <= N_NEIGHBOURS:
             self._centres = self._centres[:0]
             return
-        _, nearest = cKDTree(rest[seen]).query(rest[self._centres], k=N_NEIGHBOURS + 1)
+        _, nearest = KDTree(rest[seen]).query(rest[self._centres], k=N_NEIGHBOURS + 1)
         self._neighbours = seen[nearest[:, 1:]]
         around = rest[self._neighbours] - rest[self._centres][:, None]
         size = np.linalg.norm(around, axis=2).max(axis=1)

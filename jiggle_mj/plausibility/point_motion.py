@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..observation import MeasuredPoints, ToolState
 from .noise import NeighbourNoise, noise_of_difference
@@ -133,7 +133,7 @@ def spacing(positions: Float[np.ndarray, "n 3"]) -> float | None:
     if len(seen) < 2:
         return None
     some = seen[:: max(1, len(seen) // MAX_SPACING_POINTS)]
-    return float(np.median(cKDTree(seen).query(some, k=2)[0][:, 1]))
+    return float(np.median(KDTree(seen).query(some, k=2)[0][:, 1]))
 
 
 def common(values: Sequence[float]) -> float | None:

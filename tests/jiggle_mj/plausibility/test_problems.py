@@ -108,6 +108,7 @@ def test_noise_without_still_frames_comes_from_the_neighbours(tmp_path):
     moving = [each for each in Lift().observations() if each.tool.closed]
     found = surveyed(tmp_path, (replace(each, index=i) for i, each in enumerate(moving)))
     assert found.noise_from == "neighbours"
+    assert found.noise_sd_m is not None
     assert SD / 1.5 < found.noise_sd_m < 1.5 * SD
 
 
