@@ -31,8 +31,8 @@ def main() -> None:
     assert scenes and installed == scenes, f"the wheel lacks the scenes {scenes - installed}"
 
     assert "run" in jiggle("--help")
-    checks = json.loads(jiggle("doctor", "--json"))
-    assert checks, "the doctor said nothing"
+    found = json.loads(jiggle("doctor", "--json"))
+    assert found["checks"] and found["verdict"], "the doctor said nothing"
     jiggle("record", "free", "--out", "run.mcap")
     assert Path("run.mcap").read_bytes().startswith(b"\x89MCAP0\r\n"), "run.mcap is no MCAP file"
     assert Path("run.truth.mcap").exists(), "the recording came without its truth"

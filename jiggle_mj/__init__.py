@@ -5,8 +5,8 @@ neither JAX, MuJoCo nor OpenCV. Truth is not among them: only `jiggle_mj.eval` r
 """
 
 from importlib import import_module
-from importlib.metadata import version
-from typing import TYPE_CHECKING
+
+TYPE_CHECKING = False  # as in typing, whose import takes longer than all else of this file
 
 if TYPE_CHECKING:
     from jiggle_mj.estimator import Estimator as Estimator
@@ -166,6 +166,8 @@ def __getattr__(name: str) -> object:
         AttributeError: no such name.
     """
     if name == "__version__":
+        from importlib.metadata import version  # here, as it takes longer to import than all else of this file
+
         value: object = version("jiggle-mj")
     elif name in _MODULE_OF_NAME:
         value = getattr(import_module(_MODULE_OF_NAME[name]), name)

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from .errors import JiggleError, OptionError
+from .likely_name import did_you_mean
 
 T = TypeVar("T")
 Kind = Literal["numbers", "whole numbers", "booleans", "uint8"]
@@ -149,7 +150,9 @@ def as_choice(value: object, where: str, among: tuple[str, ...], *, error: type[
         JiggleError: `error`, where it is none of them; the message has the likely one.
     """
     if not isinstance(value, str) or value not in among:
-        raise error(f"{where} = {quoted(value)}: must be one of {', '.join(map(repr, among))}.")
+        raise error(
+            f"{where} = {quoted(value)}: must be one of {', '.join(map(repr, among))}{did_you_mean(value, among)}"
+        )
     return value
 
 

@@ -1,22 +1,26 @@
-"""Checks that this machine can run jiggle-mj: versions, JAX devices, offscreen OpenGL, cores and memory, with remedies.
+"""Checks that this machine can run jiggle-mj: versions, processor, JAX, rendering, cores and memory, with remedies.
 
-Code that may crash or hang (JAX on a broken driver, OpenGL) runs in a separate process under a time limit. Does not
-measure speed, and prints nothing: the command line shows the checks.
+Everything is tried in the user's own environment. Code that may crash or hang (JAX on a broken driver, OpenGL) runs in
+a separate process under a time limit. Does not measure speed, and prints nothing: the command line shows the checks.
 """
 
 import os
+import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
 from typing import Literal
 
 from .worker_processes import usable_cores
 
 Backend = Literal["egl", "osmesa"]
 """Value of MUJOCO_GL that renders offscreen."""
+Ability = Literal["everything", "estimates", "images", "speed"]
+"""What a failed check prevents: all verbs, estimates, rendered images; or nothing but the usual speed."""
 
 OPENGL_PACKAGES: dict[Backend, tuple[str, ...]] = {
     "egl": ("libegl1", "libgl1", "libgl1-mesa-dri"),
@@ -36,6 +40,8 @@ RENDER_LIMIT_S = 10.0
 """Time for a process to render one frame [s]; a driver that hangs never does."""
 JAX_LIMIT_S = 60.0
 """Time for a process to import JAX and list its devices [s]; only a driver that hangs takes longer."""
+CPUINFO = Path("/proc/cpuinfo")
+"""Where Linux lists the instructions that a processor has."""
 
 _RENDER_CODE = """
 import mujoco
@@ -77,6 +83,8 @@ class Check:
     """What was found on this machine."""
     remedy: str = ""
     """What the user can do; empty where nothing needs to be done."""
+    prevents: Ability = "everything"
+    """What does not work where the check fails."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +103,42 @@ def doctor() -> list[Check]:
     Returns:
         One check per subject, in a fixed order.
     """
-    return [_check_python(), *_check_packages(), check_jax(), *check_opengl(), _check_cores(), _check_memory()]
+    return [
+        _check_python(),
+        *_check_packages(),
+        check_processor(),
+        check_jax(),
+        check_rendering(),
+        _check_cores(),
+        _check_memory(),
+    ]
+
+
+def can_run(checks: Iterable[Check]) -> bool:
+    """Return whether everything works, if perhaps slowly."""
+    return all(check.ok or check.prevents == "speed" for check in checks)
+
+
+def verdict(checks: Iterable[Check]) -> str:
+    """Return in one line what cannot be done on this machine, and what can."""
+    prevented = {check.prevents for check in checks if not check.ok}
+    if not prevented:
+        return "ready"
+    if prevented == {"speed"}:
+        return "ready, but slower than documented"
+    if "everything" in prevented:
+        return "not ready: nothing is sure to run until what is marked above is mended"
+    if {"estimates", "images"} <= prevented:
+        return (
+            "not ready: nothing can be estimated, and images cannot be rendered; "
+            "'record --sensing points' and 'import' run"
+        )
+    if "estimates" in prevented:
+        return "not ready: nothing can be estimated; 'record' and 'import' run"
+    return (
+        "not ready: images cannot be rendered; everything else runs: estimates from any recording, and "
+        "'run' and 'record' with --sensing points, particles or cloud"
+    )
 
 
 def render_failure(backend: Backend, *, time_limit: float = RENDER_LIMIT_S) -> str | None:
@@ -109,14 +152,16 @@ def render_failure(backend: Backend, *, time_limit: float = RENDER_LIMIT_S) -> s
     return None if probe.ok else probe.message
 
 
-def render_probe(backend: Backend, *, time_limit: float = RENDER_LIMIT_S) -> Probe:
+def render_probe(backend: str, *, platform: str | None = None, time_limit: float = RENDER_LIMIT_S) -> Probe:
     """Render one frame offscreen in a separate process; the message is the driver's name, or the reason it failed.
 
     Args:
         backend: value of MUJOCO_GL to try.
+        platform: value of PYOPENGL_PLATFORM; that of the backend if None.
         time_limit: time after which the process is ended [s].
     """
-    return _run(_RENDER_CODE, time_limit=time_limit, MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
+    environment = {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend if platform is None else platform}
+    return _run(_RENDER_CODE, time_limit=time_limit, **environment)
 
 
 def _run(code: str, *, time_limit: float, **environment: str) -> Probe:
@@ -128,6 +173,7 @@ def _run(code: str, *, time_limit: float, **environment: str) -> Probe:
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
+            errors="replace",
             timeout=time_limit,
         )
     except subprocess.TimeoutExpired:
@@ -143,9 +189,11 @@ def _last_line(text: str) -> str:
 
 
 def _failure(stderr: str) -> str:
-    """Return the exception's line of a traceback; the lines of exceptions in clean-up code may follow it."""
-    before_clean_up = stderr.split("Exception ignored in", maxsplit=1)[0]
-    return _last_line(before_clean_up)
+    """Return the line that says why: XLA's fatal one, or a traceback's last before the lines of clean-up code."""
+    fatal = re.search(r"^F\d{4} [^\]]*\] (.*)$", stderr, flags=re.MULTILINE)
+    if fatal is not None:
+        return fatal[1].strip()
+    return _last_line(stderr.split("Exception ignored in", maxsplit=1)[0])
 
 
 def _check_python() -> Check:
@@ -182,36 +230,114 @@ def release_numbers(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", re.split(r"[^\d.]", text)[0]))
 
 
+def check_processor(cpuinfo: Path = CPUINFO, machine: str | None = None) -> Check:
+    """Check that an x86 processor has AVX, without which jaxlib ends the process.
+
+    Args:
+        cpuinfo: Linux's list of the processor's flags; where there is none the check passes.
+        machine: the architecture; this machine's if None.
+    """
+    machine = machine or platform.machine()
+    try:
+        flags = re.search(r"^flags\s*:(.*)$", cpuinfo.read_text(errors="replace"), flags=re.MULTILINE)
+    except OSError:
+        flags = None
+    lacks = machine.lower() in ("x86_64", "amd64") and flags is not None and "avx" not in flags[1].split()
+    return Check(
+        name="processor",
+        ok=not lacks,
+        detail=f"{machine}{', without AVX' if lacks else ''}",
+        remedy="jaxlib needs a processor with AVX; in a virtual machine, pass the host's through." if lacks else "",
+        prevents="estimates",
+    )
+
+
 def check_jax() -> Check:
     """Check that JAX finds a device and computes in float64 on request."""
     probe = _run(_JAX_CODE, time_limit=JAX_LIMIT_S)
     return Check(
         name="jax devices",
         ok=probe.ok,
-        detail=probe.message,
-        remedy="" if probe.ok else "Set JAX_PLATFORMS=cpu, or reinstall jax and jaxlib in matching versions.",
+        detail="no platform can be used" if probe.message == "AssertionError" else probe.message,
+        remedy="" if probe.ok else jax_remedy(probe.message, os.environ),
+        prevents="estimates",
     )
 
 
-def check_opengl(probe_backend: Callable[[Backend], Probe] = render_probe) -> list[Check]:
-    """Check both offscreen OpenGL drivers; one that works is enough, so the other one is then fine as well.
+def jax_remedy(reason: str, environment: Mapping[str, str]) -> str:
+    """Return what to do where JAX does not start, by the reason and by the variables that it reads."""
+    platforms = environment.get("JAX_PLATFORMS", "")
+    if platforms not in ("", "cpu"):
+        cuda = (
+            ", or pip install 'jiggle-mj[cuda]' for an NVIDIA GPU" if "cuda" in platforms or "gpu" in platforms else ""
+        )
+        return f"JAX_PLATFORMS={platforms} is set: unset it or set JAX_PLATFORMS=cpu{cuda}."
+    read = [name for name in environment if name.startswith("JAX_") or name == "XLA_FLAGS"]
+    named = [name for name in read if name.lower() in reason.lower()] or read
+    if named:
+        return f"Unset or correct {' or '.join(named)}."
+    return "Reinstall jax and jaxlib in matching versions."
+
+
+def jax_failure() -> str | None:
+    """Start JAX in this process and return in one line why it does not, with the remedy; None where it does.
+
+    Wrong XLA_FLAGS end a process without an exception, so they are first tried in another one.
+    """
+    processor = check_processor()
+    if not processor.ok:
+        return f"this processor has no AVX: {processor.remedy}"
+    if os.environ.get("XLA_FLAGS") and "jax" not in sys.modules:
+        probe = _run("import jax; jax.devices()", time_limit=JAX_LIMIT_S)
+        if not probe.ok:
+            return _jax_refusal(probe.message)
+    try:
+        import jax
+
+        jax.devices()
+    except Exception as failure:
+        return _jax_refusal(str(failure))
+    return None
+
+
+def _jax_refusal(message: str) -> str:
+    """Return reason and remedy in one line; where no platform can be used, JAX may fail without a message."""
+    reason = " ".join(message.split()).rstrip(".") or "it can use none of the requested platforms"
+    return f"JAX does not start: {reason}. {jax_remedy(reason, os.environ)}"
+
+
+def check_rendering(environment: Mapping[str, str] | None = None, probe: Callable[..., Probe] = render_probe) -> Check:
+    """Check that images render as a recording would render them, by the user's own MUJOCO_GL and PYOPENGL_PLATFORM.
+
+    Where they do not, both offscreen drivers are tried without these variables, to name the right remedy.
 
     Args:
-        probe_backend: renders a frame with a driver.
+        environment: the variables; this process's if None.
+        probe: renders a frame.
     """
-    probes: dict[Backend, Probe] = {backend: probe_backend(backend) for backend in OPENGL_PACKAGES}
-    one_works = any(probe.ok for probe in probes.values())
-    return [
-        Check(
-            name=f"offscreen OpenGL, {backend}",
-            ok=probe.ok or one_works,
-            detail=probe.message if probe.ok or not one_works else f"not available ({probe.message}); not needed",
-            remedy=""
-            if one_works
-            else f"apt-get install {' '.join(OPENGL_PACKAGES[backend])}, then set MUJOCO_GL={backend}.",
-        )
-        for backend, probe in probes.items()
-    ]
+    environment = os.environ if environment is None else environment
+    backend, platform = environment.get("MUJOCO_GL", ""), environment.get("PYOPENGL_PLATFORM", "")
+    own = probe(backend or "egl", platform=platform)
+    given = [f"{name}={value}" for name, value in (("MUJOCO_GL", backend), ("PYOPENGL_PLATFORM", platform)) if value]
+    used = " and ".join(given) or "egl"
+    return Check(
+        name="rendering",
+        ok=own.ok,
+        detail=f"{own.message} ({used})",
+        remedy="" if own.ok else _render_remedy(backend, platform, probe),
+        prevents="images",
+    )
+
+
+def _render_remedy(backend: str, platform: str, probe: Callable[..., Probe]) -> str:
+    """Return the shell command after which images render."""
+    unset = f"unset {' '.join(['MUJOCO_GL'] * bool(backend) + ['PYOPENGL_PLATFORM'] * bool(platform))}"
+    if (backend or platform) and probe("egl").ok:
+        return unset
+    if backend != "osmesa" and probe("osmesa").ok:
+        return "unset PYOPENGL_PLATFORM; export MUJOCO_GL=osmesa" if platform else "export MUJOCO_GL=osmesa"
+    install = f"apt-get install {' '.join(OPENGL_PACKAGES['egl'])}"
+    return f"{install}, then {unset}" if backend or platform else install
 
 
 def _check_cores() -> Check:
@@ -222,6 +348,7 @@ def _check_cores() -> Check:
         ok=ok,
         detail=str(cores),
         remedy="" if ok else "Everything works, but slower than docs/RESULTS.md says.",
+        prevents="speed",
     )
 
 
@@ -233,4 +360,5 @@ def _check_memory() -> Check:
         ok=ok,
         detail=f"{memory / 1e9:.1f} GB",
         remedy="" if ok else f"A run may need {MINIMUM_MEMORY / 1e9:.0f} GB of memory.",
+        prevents="speed",
     )

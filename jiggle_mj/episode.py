@@ -6,7 +6,7 @@ records the estimate. A recording is another source of observations. Scoring is 
 
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -138,7 +138,7 @@ def observe(
     overwrite: bool = False,
     watch: Stopwatch | None = None,
     on_refused: Callable[[ActionError], bool] | None = None,
-) -> Iterator[Observation]:
+) -> Generator[Observation, None, None]:
     """Execute actions on the reference tissue and yield one observation for each, except where a frame is lost.
 
     Args:

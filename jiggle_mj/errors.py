@@ -53,6 +53,10 @@ class RenderError(JiggleError):
     """No offscreen OpenGL on this machine."""
 
 
+class EnvironmentFault(JiggleError):
+    """The machine or its environment variables do not let JAX start; `jiggle-mj doctor` says what to do."""
+
+
 class SimulationError(JiggleError):
     """The reference simulation became unstable; the message names the dumped state."""
 

@@ -8,7 +8,7 @@ MAX_COMPARED = 200
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return ", did you mean NAME?" with the known name that is nearest, or nothing where none is near."""
+    """Return the end of a sentence about an unknown name: "; did you mean 'NAME'?", or "." where none is near."""
     by_lower = {each.lower(): each for each in known}
     near = get_close_matches(str(name)[:MAX_COMPARED].lower(), by_lower, n=1)
-    return f", did you mean {by_lower[near[0]]!r}?" if near else ""
+    return f"; did you mean {by_lower[near[0]]!r}?" if near else "."

@@ -14,7 +14,7 @@ from .disturbances.registry import DISTURBANCES, disturbed
 from .reference import Reference
 from .scene.programme import programme
 from .scene.scene import Scene
-from .scene_file import load_scene, scene_table, shipped_scenes
+from .scene_file import load_scene, scene_summary, scene_table, shipped_scenes
 
 __all__ = [
     "DISTURBANCES",
@@ -23,6 +23,7 @@ __all__ = [
     "disturbed",
     "load_scene",
     "programme",
+    "scene_summary",
     "scene_table",
     "shipped_scenes",
 ]

@@ -63,6 +63,12 @@ def shipped_scenes() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SHIPPED_FOLDER.glob("*.toml")))
 
 
+def scene_summary(name: str) -> str:
+    """Return what a shipped scene shows: the comment in the first line of its file."""
+    with (SHIPPED_FOLDER / f"{name}.toml").open(encoding="utf-8") as file:
+        return file.readline().lstrip("# ").strip()
+
+
 def load_scene(name_or_path: str | Path) -> Scene:
     """Read a shipped scene by its name, or a scene file by its path.
 
@@ -75,7 +81,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
     elif path.suffix != ".toml":
         name = str(name_or_path)
         raise SceneError(
-            f"no scene named {name!r}{did_you_mean(name, shipped_scenes())}; shipped scenes are "
+            f"no scene named {name!r}{did_you_mean(name, shipped_scenes())} Shipped scenes are "
             f"{', '.join(shipped_scenes())}, and the path of a scene file ends in .toml."
         )
     try:
@@ -124,7 +130,7 @@ def _attachment(table: dict[str, Any], *, where: str) -> Attachment:
     shape = table.get("shape")
     if not isinstance(shape, str) or shape not in SHAPES:
         hint = did_you_mean(shape, SHAPES)
-        raise SceneError(f"{where}.shape = {shown(shape)}{hint}: must be one of {', '.join(map(repr, SHAPES))}.")
+        raise SceneError(f"{where}.shape = {shown(shape)}: must be one of {', '.join(map(repr, SHAPES))}{hint}")
     return _section(SHAPES[shape], {k: v for k, v in table.items() if k != "shape"}, where=where)
 
 
@@ -149,7 +155,7 @@ def _refuse_unknown(table: dict[str, Any], known: list[str], *, where: str) -> N
     unknown = [key for key in table if key not in known]
     if unknown:
         hint = did_you_mean(unknown[0], known)
-        raise SceneError(f"unknown key {shown(unknown[0])} in {where}{hint}; known keys are {', '.join(known)}.")
+        raise SceneError(f"unknown key {shown(unknown[0])} in {where}{hint} Known keys are {', '.join(known)}.")
 
 
 def scene_table(scene: Scene) -> dict[str, Any]:

@@ -6,6 +6,7 @@ written.
 
 import platform
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -116,7 +117,7 @@ def run_scene(
     own = (RECORDING, truth_path(Path(RECORDING)).name, ESTIMATE, RESULT, REPORT)
     check_directory(directory, own, overwrite=overwrite)
     watch = Stopwatch()
-    with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference:
+    with Reference(scene, seed=seed, sensing=sensing, dump_dir=directory) as reference, ExitStack() as files:
         declaration = with_declared(reference.declaration, declare)
         estimator = Estimator(declaration, reference.camera, config=config, mask=mask, disparity=disparity)
         clear_directory(directory, own)
@@ -134,6 +135,7 @@ def run_scene(
             watch=watch,
             on_refused=None if planner is None else planner.refused,
         )
+        files.callback(frames.close)
         try:
             episode = estimate(frames, estimator, directory / ESTIMATE, metadata=about, on_frame=on_frame)
         except PerceptionError as failure:

@@ -7,6 +7,7 @@ from math import isnan
 from typing import Annotated, Literal
 
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from .options import AsJson, Disturb, Name
@@ -87,19 +88,26 @@ def scene_check(scene: Name, /, *, disturb: Disturb = (), as_json: AsJson = Fals
 def doctor(*, as_json: AsJson = False) -> None:
     """Check that this machine can run jiggle-mj, and print what to do where it cannot.
 
-    Checks package versions, JAX devices, offscreen OpenGL, cores and memory.
+    Checks package versions, the processor, JAX, rendering, cores and memory, in the environment as it is. The last line
+    says what can be done. Exits with 1 where something cannot.
 
     Args:
-        as_json: print the checks to stdout as JSON.
+        as_json: print the verdict and the checks to stdout as JSON.
     """
+    from ..doctor import can_run, verdict
     from ..doctor import doctor as run_checks
 
     checks = run_checks()
     table = Table("", "check", "found", "what to do", box=None)
     for check in checks:
-        table.add_row("[green]ok[/]" if check.ok else "[red]no[/]", check.name, check.detail, check.remedy or "")
+        table.add_row(
+            "[green]ok[/]" if check.ok else "[red]no[/]", check.name, escape(check.detail), escape(check.remedy)
+        )
     console.print(table)
+    ready = can_run(checks)
+    console.print(verdict(checks), style="bold" if ready else "bold red", highlight=False, soft_wrap=True)
     if as_json:
-        print(json.dumps([asdict(check) for check in checks]))
-    if not all(check.ok for check in checks):
+        found = {"ready": ready, "verdict": verdict(checks), "checks": [asdict(check) for check in checks]}
+        print(json.dumps(found))
+    if not ready:
         sys.exit(FAILED)

@@ -4,7 +4,7 @@ import json
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
@@ -13,14 +13,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from .interrupts import INTERRUPTED as INTERRUPTED
+from .interrupts import raise_swallowed
+
 if TYPE_CHECKING:
     from ..episode import OnFrame
     from ..estimate import Estimate
     from ..observation import Observation
 
 console = Console(stderr=True)
-FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
-"""Exit codes; 130 is 128 + SIGINT, as a shell has it."""
+FAILED, WRONG_USAGE = 1, 2
+"""Exit codes of a run that failed, and of arguments that cannot be used."""
 
 
 def log(text: str) -> None:
@@ -28,9 +31,15 @@ def log(text: str) -> None:
     console.print(text, highlight=False)
 
 
+def note(text: object) -> None:
+    """Print a line in red."""
+    console.print(f"jiggle-mj: {text}", style="red", markup=False, highlight=False, soft_wrap=True)
+
+
 def stop(failure: object, code: int) -> NoReturn:
-    """Print the reason in red, and exit with a code."""
-    console.print(f"jiggle-mj: {failure}", style="red", markup=False, highlight=False, soft_wrap=True)
+    """Print the reason in red, and exit with a code, even where stderr cannot be written."""
+    with suppress(OSError):
+        note(failure)
     sys.exit(code)
 
 
@@ -70,7 +79,18 @@ def bar(total: int, title: str) -> Iterator[Callable[..., None]]:
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as shown:
         task = shown.add_task(title, total=total)
-        yield lambda note="": shown.update(task, advance=1, description=title + note)
+
+        def advance(note: str = "") -> None:
+            raise_swallowed()
+            shown.update(task, advance=1, description=title + note)
+
+        try:
+            yield advance
+        except BaseException:
+            shown.live.transient = (
+                shown.tasks[0].completed == 0
+            )  # a bar that never moved says nothing beside the reason
+            raise
 
 
 def show(figures: dict, out: Path, as_json: bool) -> None:

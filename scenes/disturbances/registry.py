@@ -81,7 +81,7 @@ def disturbance_class(name: object) -> type[Disturbance]:
         raise SceneError('a disturbance lacks its name; write for example name = "gravity".')
     if not isinstance(name, str) or name not in DISTURBANCES:
         hint = did_you_mean(name, DISTURBANCES)
-        raise SceneError(f"no disturbance named {shown(name)}{hint}; there are {', '.join(DISTURBANCES)}.")
+        raise SceneError(f"no disturbance named {shown(name)}{hint} There are {', '.join(DISTURBANCES)}.")
     return DISTURBANCES[name]
 
 

@@ -1,6 +1,7 @@
 """The environment check reports what is installed, what is wrong and what to do about it."""
 
 import os
+import re
 import sys
 
 import numpy
@@ -17,8 +18,7 @@ def checks() -> list[doctor.Check]:
 
 def test_every_check_that_fails_carries_a_remedy_and_every_subject_is_covered(checks: list[doctor.Check]):
     names = [check.name for check in checks]
-    assert {"python", *doctor.PACKAGES, "jax devices", "cores", "memory"} <= set(names)
-    assert [name for name in names if "OpenGL" in name] == ["offscreen OpenGL, egl", "offscreen OpenGL, osmesa"]
+    assert {"python", *doctor.PACKAGES, "processor", "jax devices", "rendering", "cores", "memory"} == set(names)
     assert len(names) == len(set(names))
     for check in checks:
         assert check.detail
@@ -69,17 +69,81 @@ def test_a_broken_driver_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch
     assert failure and "\n" not in failure
 
 
-def test_no_driver_at_all_names_the_packages():
-    egl, osmesa = doctor.check_opengl(lambda backend: doctor.Probe(ok=False, message="no"))
-    assert not egl.ok and not osmesa.ok
-    assert "libegl1" in egl.remedy and "libosmesa6" in osmesa.remedy
+def driver(*working: str):
+    """A probe of a machine on which these backends render, where PYOPENGL_PLATFORM does not contradict them."""
+
+    def probe(backend: str, *, platform: str | None = None) -> doctor.Probe:
+        return doctor.Probe(ok=backend in working and platform in (None, "", backend), message=f"{backend} tried")
+
+    return probe
 
 
-def test_one_working_driver_is_enough():
-    """The other one is reported as not needed, without a remedy."""
-    egl, osmesa = doctor.check_opengl(lambda backend: doctor.Probe(ok=backend == "egl", message=f"{backend} driver"))
-    assert egl.ok and osmesa.ok and egl.detail == "egl driver" and osmesa.remedy == ""
-    assert osmesa.detail == "not available (osmesa driver); not needed"
+@pytest.mark.parametrize(
+    ("environment", "working", "remedy"),
+    [
+        ({}, (), "apt-get install libegl1 libgl1 libgl1-mesa-dri"),
+        ({}, ("osmesa",), "export MUJOCO_GL=osmesa"),
+        ({"MUJOCO_GL": "glfw"}, ("egl",), "unset MUJOCO_GL"),
+        ({"MUJOCO_GL": "banana"}, ("osmesa",), "export MUJOCO_GL=osmesa"),
+        ({"MUJOCO_GL": "osmesa"}, (), "apt-get install libegl1 libgl1 libgl1-mesa-dri, then unset MUJOCO_GL"),
+        ({"PYOPENGL_PLATFORM": "glx"}, ("egl",), "unset PYOPENGL_PLATFORM"),
+        ({"MUJOCO_GL": "glfw", "PYOPENGL_PLATFORM": "glx"}, ("egl",), "unset MUJOCO_GL PYOPENGL_PLATFORM"),
+    ],
+)
+def test_where_the_users_own_environment_does_not_render_the_command_that_mends_it_is_named(
+    environment: dict[str, str], working: tuple[str, ...], remedy: str
+):
+    check = doctor.check_rendering(environment, driver(*working))
+    assert (check.ok, check.remedy, check.prevents) == (False, remedy, "images")
+
+
+@pytest.mark.parametrize("environment", [{}, {"MUJOCO_GL": "egl"}, {"MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "egl"}])
+def test_a_driver_that_works_in_the_users_own_environment_needs_nothing(environment: dict[str, str]):
+    check = doctor.check_rendering(environment, driver("egl"))
+    assert (check.ok, check.remedy) == (True, "")
+
+
+@pytest.mark.parametrize(
+    ("prevented", "can_run", "words"),
+    [
+        ((), True, "ready"),
+        (("speed",), True, "slower"),
+        (("images",), False, "images cannot be rendered; everything else runs"),
+        (("estimates",), False, "nothing can be estimated; 'record' and 'import' run"),
+        (("estimates", "images"), False, "images cannot be rendered"),
+        (("everything", "speed"), False, "nothing is sure to run"),
+    ],
+)
+def test_the_verdict_says_what_cannot_be_done_and_what_can(prevented: tuple[str, ...], can_run: bool, words: str):
+    checks = [doctor.Check(name="python", ok=True, detail="3.13.0")]
+    checks += [doctor.Check(name=each, ok=False, detail="no", remedy="do", prevents=each) for each in prevented]  # pyright: ignore[reportArgumentType]
+    assert doctor.can_run(checks) == can_run and words in doctor.verdict(checks)
+
+
+@pytest.mark.parametrize(
+    ("flags", "machine", "ok"),
+    [("fpu sse2 avx avx2", "x86_64", True), ("fpu sse2", "x86_64", False), ("fp asimd", "aarch64", True)],
+)
+def test_an_x86_processor_without_avx_is_named(tmp_path, flags: str, machine: str, ok: bool):
+    """jaxlib ends the process on such a processor; others have no AVX and need none."""
+    (tmp_path / "cpuinfo").write_text(f"processor : 0\nflags\t\t: {flags}\nbugs :\n")
+    check = doctor.check_processor(tmp_path / "cpuinfo", machine)
+    assert check.ok == ok and ("AVX" in check.remedy) == (not ok)
+    assert doctor.check_processor(tmp_path / "missing", machine).ok
+
+
+@pytest.mark.parametrize(
+    ("reason", "environment", "remedy"),
+    [
+        ("", {"JAX_PLATFORMS": "cuda"}, r"JAX_PLATFORMS=cuda is set: .*jiggle-mj\[cuda\]"),
+        ("invalid truth value 'maybe' for environment 'JAX_ENABLE_X64'", {"JAX_ENABLE_X64": "maybe", "JAX_A": "1"},
+         r"^Unset or correct JAX_ENABLE_X64\.$"),
+        ("Unknown flag in XLA_FLAGS: --x", {"XLA_FLAGS": "--x"}, "Unset or correct XLA_FLAGS"),
+        ("no such symbol", {}, "Reinstall jax"),
+    ],
+)  # fmt: skip
+def test_what_keeps_jax_from_starting_is_named(reason: str, environment: dict[str, str], remedy: str):
+    assert re.search(remedy, doctor.jax_remedy(reason, environment))
 
 
 def test_jax_without_a_usable_platform_is_reported(monkeypatch: pytest.MonkeyPatch):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from jiggle_mj import cli
+from jiggle_mj.cli.running import VERBS
 from jiggle_mj.errors import SceneError
 from jiggle_mj.estimator.summaries import RULE
 from jiggle_mj.scenes import DISTURBANCES, load_scene, shipped_scenes
@@ -132,7 +133,7 @@ def test_every_command_in_the_pages_exists(
 ):
     """Each verb is one of the command line's, and takes the options that stand behind it."""
     for verb, options in commands(path.read_text(encoding="utf-8")):
-        assert verb.split()[0] in cli.VERBS
+        assert verb.split()[0] in VERBS
         assert set(options) <= known_options(verb, monkeypatch, capsys), verb
 
 
@@ -152,7 +153,7 @@ def test_the_results_have_one_current_figure_for_each_claim():
 
 
 def test_the_usage_page_shows_every_verb():
-    assert {verb.split()[0] for verb, _ in commands(USAGE)} == set(cli.VERBS)
+    assert {verb.split()[0] for verb, _ in commands(USAGE)} == set(VERBS)
 
 
 def test_every_option_that_readme_usage_and_results_name_exists(
@@ -160,7 +161,7 @@ def test_every_option_that_readme_usage_and_results_name_exists(
 ):
     """Also those that are named apart from a command."""
     pages = (README, USAGE, METHOD, RESULTS, STUDIES)
-    verbs = {*cli.VERBS, *(verb for page in pages for verb, _ in commands(page))}
+    verbs = {*VERBS, *(verb for page in pages for verb, _ in commands(page))}
     known = set().union(*(known_options(verb, monkeypatch, capsys) for verb in sorted(verbs)))
     assert set(re.findall(OPTION, "".join(pages))) <= known
 
