@@ -7,6 +7,7 @@ constructors check what they are given. No check copies an array that is right a
 import math
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from operator import index
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -98,9 +99,12 @@ def as_number(
     Raises:
         JiggleError: `error`, where it is no number, not finite, or out of bounds.
     """
-    is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if is_number and math.isfinite(value) and above < value < below and value >= at_least:
-        return float(value)
+    number = math.nan
+    if isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool):
+        with suppress(OverflowError):  # an integer beyond the largest float
+            number = float(value)
+    if math.isfinite(number) and above < number < below and number >= at_least:
+        return number
     bounds = [
         text
         for text, bounded in (

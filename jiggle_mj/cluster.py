@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 
+from .argument_checks import as_instance, as_number
 from .errors import ClusterError, OptionError
 
 URL = r"dask://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):(\d{1,5})"
@@ -33,9 +34,12 @@ def cluster(
         worker_timeout_s: how long the first worker may take to join [s].
 
     Raises:
-        OptionError: the URL has another form.
+        OptionError: the URL has another form, or a time is not above 0.
         ClusterError: Dask is not installed, no scheduler answers, or it has no workers.
     """
+    as_instance(url, "executor", str, hint="It is dask://HOST:PORT.")
+    connect_timeout_s = as_number(connect_timeout_s, "connect_timeout_s", unit="s", above=0)
+    worker_timeout_s = as_number(worker_timeout_s, "worker_timeout_s", unit="s", above=0)
     address = re.fullmatch(URL, url)
     if address is None or int(address[2]) > MAX_PORT:
         raise OptionError(f"executor = {url!r}: must be dask://HOST:PORT, as in dask://10.0.0.5:8786.")

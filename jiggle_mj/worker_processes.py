@@ -21,6 +21,10 @@ from typing import Any, TypeVar
 from .argument_checks import as_integer
 
 T = TypeVar("T")
+NO_ANSWER_HINT = (
+    "; if no process ever answers: a script must create WorkerProcesses under 'if __name__ == \"__main__\":'"
+)
+"""What usually is wrong where a new process dies before its first answer."""
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -87,7 +91,7 @@ class _Worker:
 
     def __init__(self) -> None:
         self._running: tuple[SpawnProcess, Connection] | None = None
-        self._stopped = False
+        self._stopped, self._answered = False, False
         self._lock = threading.Lock()
 
     def call(self, fn: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any]) -> T:
@@ -102,7 +106,9 @@ class _Worker:
             returned, value = connection.recv()
         except (EOFError, OSError) as death:
             self.end()
-            raise BrokenExecutor(f"a worker process died (exit code {process.exitcode})") from death
+            why = f"a worker process died (exit code {process.exitcode})"
+            raise BrokenExecutor(why if self._answered else f"{why}{NO_ANSWER_HINT}") from death
+        self._answered = True
         if returned:
             return value
         raise value

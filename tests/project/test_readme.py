@@ -162,7 +162,7 @@ def test_every_option_that_readme_usage_and_results_name_exists(
     """Also those that are named apart from a command."""
     pages = (README, USAGE, METHOD, RESULTS, STUDIES)
     verbs = {*VERBS, *(verb for page in pages for verb, _ in commands(page))}
-    known = set().union(*(known_options(verb, monkeypatch, capsys) for verb in sorted(verbs)))
+    known = {"--version"}.union(*(known_options(verb, monkeypatch, capsys) for verb in sorted(verbs)))
     assert set(re.findall(OPTION, "".join(pages))) <= known
 
 

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 
 import jiggle_mj as jm
+from jiggle_mj.cluster import cluster
 from jiggle_mj.scenes import disturbed
 
 POSE = np.eye(4)
@@ -50,7 +51,7 @@ def changed(name: str, make: Callable[..., object], good: dict, wrong: dict[str,
 def constructors() -> Iterator[Use]:
     """Yield wrong arguments of actions, observations, meshes, declarations and cameras."""
     three = ([0, 0], np.zeros((1, 3)), "origin", None, [0, 0, NAN], [0, 0, "1 mm"])
-    above_zero = (0, -1e-3, NAN, INF, "5 mm", None, [5e-3])
+    above_zero = (0, -1e-3, NAN, INF, "5 mm", 10**400, None, [5e-3])
     yield from changed(
         "Grasp", jm.Grasp, {"point": np.zeros(3), "radius": 5e-3}, {"point": three, "radius": above_zero}
     )
@@ -94,7 +95,7 @@ def constructors() -> Iterator[Use]:
     yield from changed("DeclaredMesh", jm.DeclaredMesh, TRIANGLE, wrong)
     wrong = {
         "membrane_stiffness": above_zero,
-        "thickness": above_zero[:5],
+        "thickness": above_zero[:6],
         "poisson": (0.5, -0.1, NAN, "0.4", None),
         "gravity": (-9.81, (0, 0), (0, 0, NAN), "down", None),
         "bed": ("yes", None),
@@ -193,6 +194,9 @@ def engines(folder: Path) -> Iterator[Use]:
         yield f"write({str(given)[:20]})", lambda given=given: jm.RecordingWriter(**good, overwrite=True).write(given)
     for count in (0, 1.5, "2"):
         yield f"WorkerProcesses({count!r})", lambda count=count: jm.WorkerProcesses(count)
+    for url in (3, None, "localhost", "dask://x:99999"):
+        yield f"cluster({url!r})", lambda url=url: cluster(url).__enter__()
+    yield "cluster(timeout)", lambda: cluster("dask://localhost:1", connect_timeout_s=-1).__enter__()
     series = {"scene": SMALL, "folder": folder / "s", "count": 1}
     wrong = {
         "scene": ("arc",),
