@@ -21,7 +21,8 @@ from ..likely_name import did_you_mean
 from .checks import bench, doctor, scene_check
 from .environment import open_standard_streams, require_jax, require_working_folder
 from .estimating import close_loop, estimate, identify, run, score
-from .importing import import_, inspect
+from .importing import import_
+from .importing import inspect as inspect_
 from .init import init
 from .interrupts import leaving_at_once, unwinding
 from .listing import disturbances, effects, scenes
@@ -34,7 +35,7 @@ VERBS: dict[str, Callable[..., None]] = {
     "record": record,
     "init": init,
     "import": import_,
-    "inspect": inspect,
+    "inspect": inspect_,
     "estimate": estimate,
     "identify": identify,
     "close-loop": close_loop,
@@ -51,7 +52,9 @@ VERBS: dict[str, Callable[..., None]] = {
 HEAVY: dict[str, tuple[str, ...]] = {
     "run": ("jax", "jiggle_mj.eval.runs.experiment", "jiggle_mj.scenes"),
     "record": ("jiggle_mj.scenes", "jiggle_mj.episode"),
+    "init": ("jiggle_mj.importing.init",),
     "import": ("jiggle_mj.importing.folder",),
+    "inspect": ("jiggle_mj.importing.bags.inspection",),
     "estimate": ("jax", "jiggle_mj.eval.runs.experiment"),
     "identify": ("jax", "jiggle_mj.estimator", "jiggle_mj.episode"),
     "close-loop": ("jax", "jiggle_mj.eval.runs.closing_the_loop"),
