@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from .observation import Observation as Observation
     from .observation import StereoPair as StereoPair
     from .observation import ToolState as ToolState
-    from .plausibility.problems import Problem as Problem
+    from .plausibility.problems import RecordingProblem as RecordingProblem
     from .plausibility.problems import problems as problems
     from .plausibility.survey import Survey as Survey
     from .plausibility.survey import survey as survey
@@ -90,9 +90,9 @@ __all__ = [
     "OptionError",
     "OutputError",
     "PerceptionError",
-    "Problem",
     "Recording",
     "RecordingError",
+    "RecordingProblem",
     "RecordingSeries",
     "RecordingWriter",
     "Reference",
@@ -136,6 +136,7 @@ _NAMES_OF_MODULE = {
         "OutputError",
         "PerceptionError",
         "RecordingError",
+        "RecordingProblem",
         "RenderError",
         "SceneError",
         "SimulationError",
@@ -148,7 +149,7 @@ _NAMES_OF_MODULE = {
     "importing.folder": ("import_folder",),
     "material": ("Material",),
     "observation": ("Declaration", "DeclaredMesh", "MeasuredPoints", "Observation", "StereoPair", "ToolState"),
-    "plausibility.problems": ("Problem", "problems"),
+    "plausibility.problems": ("RecordingProblem", "problems"),
     "plausibility.survey": ("Survey", "survey"),
     "recording.reader": ("Recording",),
     "recording.writer": ("RecordingWriter",),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.table import Column, Table
 
-from ..errors import OptionError, RecordingError
+from ..errors import OptionError
 from .options import AsJson, Out, PathArgument
 from .survey import show_survey
 from .terminal import console
@@ -137,7 +137,7 @@ def _import_bag(path: Path, out: Path, settings: "BagSettings", *, overwrite: bo
     from ..importing.bags.importer import import_bag
 
     summary = import_bag(path, out, settings, overwrite=overwrite)
-    _refuse_implausible(summary.recording, None)
+    show_survey(summary.recording)
     table = Table("role", "topic", "", box=None)
     for role, name in summary.topics.items():
         table.add_row(role, name, "guessed" if role in summary.guessed else "given")
@@ -164,7 +164,7 @@ def _import_folder(
     from ..importing.folder import import_folder
 
     summary = import_folder(folder, recording, out, overwrite=overwrite, allow_outside=allow_outside)
-    _refuse_implausible(summary.recording, summary.truth)
+    show_survey(summary.recording)
     for note in summary.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     for name, why in summary.skipped:
@@ -175,18 +175,3 @@ def _import_folder(
     )
     if as_json:
         print(json.dumps(asdict(summary), default=str))
-
-
-def _refuse_implausible(recording: Path, truth: Path | None) -> None:
-    """Print the survey of a recording; remove it with its truth where it cannot be right.
-
-    Raises:
-        RecordingError: it is implausible.
-    """
-    try:
-        show_survey(recording)
-    except RecordingError:
-        for path in (recording, truth):
-            if path is not None:
-                path.unlink(missing_ok=True)
-        raise

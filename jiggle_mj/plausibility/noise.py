@@ -50,7 +50,7 @@ class NeighbourNoise:
         if len(seen) <= N_NEIGHBOURS:
             self._centres = self._centres[:0]
             return
-        _, nearest = KDTree(rest[seen]).query(rest[self._centres], k=N_NEIGHBOURS + 1)
+        nearest = np.asarray(KDTree(rest[seen]).query(rest[self._centres], k=N_NEIGHBOURS + 1)[1])
         self._neighbours = seen[nearest[:, 1:]]
         around = rest[self._neighbours] - rest[self._centres][:, None]
         size = np.linalg.norm(around, axis=2).max(axis=1)

@@ -43,7 +43,7 @@ MAX_UNSEEN = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Implausibility:
+class RecordingProblem:
     """One thing about a recording that is wrong or doubtful."""
 
     name: str
@@ -54,13 +54,13 @@ class Implausibility:
     """What was found, what is usual, and what to do; one sentence or two."""
 
 
-def problems(survey: Survey) -> tuple[Implausibility, ...]:
+def problems(survey: Survey) -> tuple[RecordingProblem, ...]:
     """Return all problems of a surveyed recording, those that refuse it first."""
     found = [*_use(survey), *_size(survey), *_times(survey), *_camera(survey), *_tool(survey), *_noise(survey)]
     return tuple(sorted(found, key=lambda problem: not problem.refuses))
 
 
-def _use(survey: Survey) -> Iterator[Implausibility]:
+def _use(survey: Survey) -> Iterator[RecordingProblem]:
     """Find what leaves nothing to estimate from."""
     if not survey.frames:
         yield _refuse(
@@ -82,7 +82,7 @@ def _use(survey: Survey) -> Iterator[Implausibility]:
         yield _warn("unseen", f"{survey.unseen:.0%} of the points are not seen; is a missing value read as such?")
 
 
-def _size(survey: Survey) -> Iterator[Implausibility]:
+def _size(survey: Survey) -> Iterator[RecordingProblem]:
     """Find a sheet in the wrong unit."""
     size = survey.extent_m
     if size is None:
@@ -100,7 +100,7 @@ def _size(survey: Survey) -> Iterator[Implausibility]:
         yield _warn("extent", f"the sheet is {metres(size)} wide; is the unit of length right?")
 
 
-def _times(survey: Survey) -> Iterator[Implausibility]:
+def _times(survey: Survey) -> Iterator[RecordingProblem]:
     """Find times in the wrong unit, and gaps."""
     period, gap = survey.period_s, survey.largest_gap_s
     if period is None:
@@ -119,7 +119,7 @@ def _times(survey: Survey) -> Iterator[Implausibility]:
                     f"{seconds(period)}; are frames lost, or is a release missing?")  # fmt: skip
 
 
-def _camera(survey: Survey) -> Iterator[Implausibility]:
+def _camera(survey: Survey) -> Iterator[RecordingProblem]:
     """Find a camera that cannot see the tool, or whose baseline has the wrong unit."""
     baseline, size = survey.baseline_m, survey.image_size
     if baseline is None or size is None:
@@ -154,7 +154,7 @@ def _camera(survey: Survey) -> Iterator[Implausibility]:
         yield _warn("tool-view", "the tool is outside the left image when the jaws close; do /tf and its pose fit?")
 
 
-def _tool(survey: Survey) -> Iterator[Implausibility]:
+def _tool(survey: Survey) -> Iterator[RecordingProblem]:
     """Find a tool that is elsewhere, or of another clock, and a sheet that does not move."""
     distance, size = survey.tool_distance_m, survey.extent_m
     if distance is not None and size is not None and not survey.tool_by_points:
@@ -216,7 +216,7 @@ def _tool(survey: Survey) -> Iterator[Implausibility]:
         yield _warn("tool-speed", f"the tool moves at up to {survey.tool_speed_m_s:.3g} m/s; are times and unit right?")
 
 
-def _noise(survey: Survey) -> Iterator[Implausibility]:
+def _noise(survey: Survey) -> Iterator[RecordingProblem]:
     """Find a declared noise that the measured one contradicts."""
     declared, measured = survey.declared_sd_m, survey.noise_sd_m
     if declared is None or measured is None or survey.sensing != "points":
@@ -239,15 +239,15 @@ def _within(value: float, limits: tuple[float, float]) -> bool:
     return limits[0] <= value <= limits[1]
 
 
-def _problem(name: str, text: str, *, refuses: bool) -> Implausibility:
-    return Implausibility(name=name, refuses=refuses, text=text)
+def _problem(name: str, text: str, *, refuses: bool) -> RecordingProblem:
+    return RecordingProblem(name=name, refuses=refuses, text=text)
 
 
-def _refuse(name: str, text: str) -> Implausibility:
+def _refuse(name: str, text: str) -> RecordingProblem:
     return _problem(name, text, refuses=True)
 
 
-def _warn(name: str, text: str) -> Implausibility:
+def _warn(name: str, text: str) -> RecordingProblem:
     return _problem(name, text, refuses=False)
 
 

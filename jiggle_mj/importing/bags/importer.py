@@ -21,7 +21,7 @@ from ...errors import OutputError, RecordingError
 from ...observation import MeasuredPoints, Observation, StereoPair, ToolState
 from ...recording.declaration import identity
 from ...recording.writer import RecordingWriter
-from ..declaration import DEFAULT_GRASP_RADIUS
+from ..grasp_table import DEFAULT_GRASP_RADIUS
 from .bag_file import Bag
 from .bag_paths import refusing
 from .camera_order import left_is_left
