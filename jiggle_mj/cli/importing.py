@@ -137,7 +137,6 @@ def _import_bag(path: Path, out: Path, settings: "BagSettings", *, overwrite: bo
     from ..importing.bags.importer import import_bag
 
     summary = import_bag(path, out, settings, overwrite=overwrite)
-    show_survey(summary.recording)
     table = Table("role", "topic", "", box=None)
     for role, name in summary.topics.items():
         table.add_row(role, name, "guessed" if role in summary.guessed else "given")
@@ -154,6 +153,7 @@ def _import_bag(path: Path, out: Path, settings: "BagSettings", *, overwrite: bo
         highlight=False,
         soft_wrap=True,
     )
+    show_survey(summary.recording)
     if as_json:
         print(json.dumps({f.name: getattr(summary, f.name) for f in fields(summary)}, default=str))
 
@@ -164,7 +164,6 @@ def _import_folder(
     from ..importing.folder import import_folder
 
     summary = import_folder(folder, recording, out, overwrite=overwrite, allow_outside=allow_outside)
-    show_survey(summary.recording)
     for note in summary.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     for name, why in summary.skipped:
@@ -173,5 +172,6 @@ def _import_folder(
         f"wrote {summary.recording}: {summary.n_frames} frames of {summary.n_points} points, {summary.n_unseen} "
         f"missing points over all frames, {summary.n_held} held; truth: {summary.truth or 'none'}"
     )
+    show_survey(summary.recording)
     if as_json:
         print(json.dumps(asdict(summary), default=str))
