@@ -15,6 +15,7 @@ from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.truth import read_truth
 from jiggle_mj.recording.writer import RecordingWriter
 from jiggle_mj.scenes import Reference, load_scene, programme
+from tests.support.recordings import malformed
 from tests.support.tiny_scene import scene_file
 
 
@@ -84,7 +85,7 @@ def test_frames_that_the_recording_skips_are_named_when_none_remains(recording, 
     path = tmp_path / "blind.mcap"
     with RecordingWriter(path, camera=None, declaration=Declaration(), metadata={}) as writer:
         for observation in seen[:4]:
-            blind = replace(observation.tool, position=np.full(3, np.nan))
+            blind = malformed(observation.tool, position=np.full(3, np.nan))
             writer.write(replace(observation, tool=blind))
     opened = Recording.open(path)
     with pytest.raises(PerceptionError, match="frame 0: NaN"):
@@ -94,7 +95,7 @@ def test_frames_that_the_recording_skips_are_named_when_none_remains(recording, 
 def test_frames_skipped_by_recording_and_estimator_are_counted_together(recording, tmp_path):
     _, seen = recording
     first = next(observation for observation in seen if observation.tool.closed)
-    lost = replace(first, index=first.index + 1, tool=replace(first.tool, position=np.full(3, np.nan)))
+    lost = replace(first, index=first.index + 1, tool=malformed(first.tool, position=np.full(3, np.nan)))
     nowhere = replace(first.points, positions=np.full_like(first.points.positions, np.nan))
     hidden = replace(seen[lost.index + 1], points=nowhere)
     with RecordingWriter(tmp_path / "gaps.mcap", camera=None, declaration=Declaration(), metadata={}) as writer:
