@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, ParamSpec, TypeVar
 
+from ..argument_checks import as_path
 from ..errors import OutputError
 
 PARTIAL_SUFFIX = ".part"
@@ -154,7 +155,8 @@ def fills_folder(job: Callable[Parameters, Returned]) -> Callable[Parameters, Re
 
     @functools.wraps(job)
     def alone(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Returned:
-        with folder_lock(Path(signature.bind(*args, **kwargs).arguments["directory"])):
+        directory = as_path(signature.bind(*args, **kwargs).arguments["directory"], "the folder")
+        with folder_lock(directory):
             return job(*args, **kwargs)
 
     return alone

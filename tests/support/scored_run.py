@@ -8,9 +8,12 @@ import numpy as np
 
 from jiggle_mj.episode import Episode
 from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.eval.metrics.result import Run, result, with_truth
 from jiggle_mj.eval.metrics.result_file import IDENTITY, RECORDED, write_result
+from jiggle_mj.eval.runs.settings_used import settings_used
 from jiggle_mj.limits import Limits
+from jiggle_mj.observation import Declaration
 from jiggle_mj.recording.estimate import EstimateWriter
 from jiggle_mj.recording.truth import write_truth
 from jiggle_mj.truth import Truth, TruthFrame
@@ -85,6 +88,7 @@ def unscored(limits: Limits | None = None) -> dict:
             policy="corners",
             episode=EPISODE,
             limits=limits,
+            settings=settings_used(Declaration(), EstimatorConfig(), declare=None, declared=True),
         )
     )
 

@@ -29,10 +29,10 @@ BASELINE_AGREEMENT = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSource:
-    """What a bag or a file says of one camera; P may be zero, which `CameraCalibration` refuses to mean anything."""
+    """What a bag or a file says of one camera."""
 
     calibration: CameraCalibration
-    """The calibration, with its own P."""
+    """The calibration, with its own P, or [K 0] where P is missing or zero."""
     frame: str
     """Name of the optical frame; empty for a file."""
     where: str
@@ -190,7 +190,7 @@ def _source(
             width=width,
             height=height,
             K=K.reshape(3, 3),
-            P=P.reshape(3, 4),
+            P=P.reshape(3, 4) if P[0] > 0 else np.hstack([K.reshape(3, 3), np.zeros((3, 1))]),
             D=_padded(D),
             R=R.reshape(3, 3),
         ),
@@ -208,7 +208,7 @@ def _padded(D: Float[np.ndarray, " d"]) -> Float[np.ndarray, " e"]:
 def _baseline(left: CameraCalibration, right: CameraCalibration) -> float | None:
     """Return the baseline [m] that two P give; None where they give none. Either camera may be the reference."""
     fx_left, fx_right = left.P[0, 0], right.P[0, 0]
-    if not (fx_left > 0 and fx_right > 0) or left.P[0, 3] == right.P[0, 3] == 0:
+    if left.P[0, 3] == right.P[0, 3] == 0:
         return None
     return float(left.P[0, 3] / fx_left - right.P[0, 3] / fx_right)
 
@@ -216,10 +216,8 @@ def _baseline(left: CameraCalibration, right: CameraCalibration) -> float | None
 def _pair_along_x(
     left: CameraCalibration, right: CameraCalibration, baseline: float
 ) -> tuple[CameraCalibration, CameraCalibration]:
-    """Return the pair with the left camera as the reference; a missing P is K."""
-    P_left, P_right = (
-        (each.P if each.P[0, 0] > 0 else np.hstack([each.K, np.zeros((3, 1))])).copy() for each in (left, right)
-    )
+    """Return the pair with the left camera as the reference."""
+    P_left, P_right = left.P.copy(), right.P.copy()
     P_left[0, 3], exact = 0.0, P_right[0, 3]
     P_right[0, 3] = -P_right[0, 0] * baseline
     if left.P[0, 3] == 0 and exact < 0 and np.isclose(exact, P_right[0, 3]):

@@ -13,6 +13,7 @@ from jiggle_mj.estimator.attribution.suggestion import expected_log_bayes_factor
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.eval.report.discrepancy_page import story, write_page
 from jiggle_mj.eval.runs import closing_the_loop as closing_run
+from jiggle_mj.observation import Declaration
 from tests.support.small_sheet import sheet
 
 
@@ -30,7 +31,7 @@ def test_the_file_and_the_page_hold_the_result(light, tmp_path):
 
 def test_the_result_is_written_before_a_pull_is_searched_for(light, tmp_path, monkeypatch):
     closed, _, dataset = light
-    recording = SimpleNamespace(declaration=None, camera=None, metadata={"name": "light"})
+    recording = SimpleNamespace(declaration=Declaration(), declared=True, camera=None, metadata={"name": "light"})
 
     def stopped(*_, **__):
         raise KeyboardInterrupt

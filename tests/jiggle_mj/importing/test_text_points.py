@@ -94,7 +94,7 @@ def test_two_columns_are_points_of_a_plane(tmp_path):
 
 
 WHOLE = "\n".join(f"{i * i},125,{3 * i},250,7,5" for i in range(12))
-THOUSANDS = "\n".join(f"1,{100 + i};2,{200 + i * i};3,500" for i in range(12))
+THOUSANDS = "\n".join(f"{1 + i},{100 + i};2,{200 + i * i};3,500" for i in range(12))
 
 
 @pytest.mark.parametrize(
