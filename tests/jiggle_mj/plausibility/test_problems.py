@@ -115,7 +115,7 @@ def test_noise_without_still_frames_comes_from_the_neighbours(tmp_path):
 @pytest.mark.parametrize(
     ("mistake", "refuses"),
     [
-        ({"unit": 1e2}, "extent"),
+        ({"unit": 300.0}, "extent"),
         ({"unit": 1e-3}, "extent"),
         ({"tool_unit": 1e3}, "tool-distance"),
         ({"still_tool": True}, "tool-still"),
