@@ -64,7 +64,7 @@ def _use(survey: Survey) -> Iterator[RecordingProblem]:
     """Find what leaves nothing to estimate from."""
     if not survey.frames:
         yield _refuse(
-            "no-frame", f"none of the {survey.skipped} frames can be used; the reasons are those of 'skipped'."
+            "no-frame", f"none of the {survey.skipped} frames can be used; the first one: {survey.first_skipped}."
         )
         return
     if not survey.closed_frames:
@@ -176,7 +176,9 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
     held, tool = survey.held_motion_m, survey.tool_motion_m
     noise = NOISE_MULTIPLES * (survey.noise_sd_m or 0.0)
     if (held is None or held <= noise) and tool <= noise and (survey.closed_frames > 1 or not survey.tool_by_points):
-        if survey.points_motion_m is None or survey.points_motion_m <= noise:
+        if survey.points_motion_m is None:
+            yield _warn("tool-still", "the tool does not move; nothing can be learned from it.")
+        elif survey.points_motion_m <= noise:
             yield _refuse(
                 "no-motion",
                 f"nothing moves: tool {metres(tool)}, held points {metres(held or 0.0)}, noise "

@@ -29,6 +29,8 @@ class Survey:
     """What is seen: stereo images, points with identities, or points without; nothing if no frame can be used."""
     frames: int
     """Usable frames."""
+    first_skipped: str
+    """Why the first unusable frame cannot be used; empty without one."""
     skipped: int
     """Frames that cannot be used."""
     span_s: float
@@ -186,6 +188,7 @@ def survey(recording: Recording) -> Survey:
     return Survey(
         sensing="stereo" if recording.camera is not None and times else seen,
         frames=len(times),
+        first_skipped=recording.skipped[0][1] if recording.skipped else "",
         skipped=len(recording.skipped),
         span_s=(times[-1] - times[0]) * NS if times else 0.0,
         period_s=float(np.median(steps)) * NS if len(steps) else None,
