@@ -65,7 +65,7 @@ class Estimator:
             OptionError: an argument is of another type.
         """
         self.declaration = as_instance(declaration, "declaration", Declaration, hint="Declaration() has defaults.")
-        self.config = config = as_instance(config or EstimatorConfig(), "config", EstimatorConfig)
+        self.config = config = as_instance(EstimatorConfig() if config is None else config, "config", EstimatorConfig)
         self.skipped: list[tuple[int, str]] = []
         """Index and reason of each observation that could not be used."""
         self._perception = Perception(

@@ -56,9 +56,10 @@ class Perception:
         """
         if camera is not None:
             as_instance(camera, "camera", StereoCamera, hint="Recording.camera and Reference.camera are such.")
-        for name, function in (("mask", mask), ("disparity", disparity)):
-            if function is not None:
-                as_function(function, name)
+        if mask is not None and not isinstance(mask, FrameMask):
+            as_function(mask, "mask")
+        if disparity is not None:
+            as_function(disparity, "disparity")
         self._declaration, self._spacing, self._config = declaration, spacing, config or PerceptionConfig()
         self._stereo = (
             None

@@ -150,7 +150,7 @@ def engines(folder: Path) -> Iterator[Use]:
     wrong = {
         "declaration": (None, {"poisson": 0.4}, 30.0),
         "camera": ("left", K, POSE),
-        "config": ({"seed": 1}, "implicit"),
+        "config": ({"seed": 1}, {}, "implicit"),
         "mask": (RGB, "grabcut"),
         "disparity": (16, "sgbm"),
     }

@@ -1,13 +1,16 @@
 """Masks from files, and the refusal of a colour mask in doubt."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from jiggle_mj.errors import MaskError, OptionError, PerceptionError
+from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.perception import GrabCut, StereoTracker
 from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
-from jiggle_mj.observation import StereoPair
+from jiggle_mj.observation import Declaration, Observation, StereoPair
 from tests.support.perception_plane import HEIGHT, WIDTH, PlaneSheet, camera, stereo
 from tests.support.recordings import tool
 
@@ -63,8 +66,21 @@ def test_grey_images_need_a_mask(tmp_path):
         StereoTracker(camera(), mask=mask_named(str(tmp_path / name))).start(grey, tool())
         for name in ("mask.png", "mask.npy", "mask.npz", "all")
     ]
-    for sheet in sheets[1:]:
-        np.testing.assert_array_equal(sheet.rest.shape, sheets[0].rest.shape)
+    of_one_image, of_both_images = sheets[:2], sheets[2:]
+    for first, second in (of_one_image, of_both_images):
+        np.testing.assert_array_equal(first.rest, second.rest)
+
+
+def test_the_estimator_takes_the_mask_of_a_file(tmp_path):
+    pair = stereo(PlaneSheet())
+    grey = StereoPair(left=np.repeat(pair.left[..., :1], 3, axis=2), right=np.repeat(pair.right[..., :1], 3, axis=2))
+    inside = np.zeros((HEIGHT, WIDTH), np.uint8)
+    inside[65:235, 115:285] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), inside)
+    estimator = Estimator(Declaration(), camera(), mask=mask_named(str(tmp_path / "mask.png")))
+    still = replace(tool(), closed=False)
+    assert estimator.update(Observation(index=0, time=0, tool=still, images=grey)) is None
+    assert estimator.skipped == []
 
 
 def test_a_mask_that_cannot_be_used_is_refused_by_name(tmp_path):
