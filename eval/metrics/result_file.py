@@ -11,7 +11,7 @@ from jiggle_mj.recording.json_values import entry, optional, parse_object
 from jiggle_mj.recording.output_files import write_text
 from jiggle_mj.recording.reader import PAIRING_TOLERANCE_NS
 from jiggle_mj.recording.truth import read_truth
-from jiggle_mj.toml_kinds import count, counts, flag, integer, number, positive, table, tables, text
+from jiggle_mj.toml_kinds import count, counts, flag, number, positive, table, tables, text
 from jiggle_mj.truth import Truth
 
 Json = dict[str, object]
@@ -24,12 +24,19 @@ MADE_BY = "'jiggle-mj table' writes it; delete it, and it is made anew"
 """Origin of a file that a study keeps for one of its cells."""
 
 
+def _seed(value: Any) -> int:
+    """Return a seed, which may have any number of digits."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise TypeError("a whole number from 0")
+    return value
+
+
 KINDS: dict[str, Kind] = {
     "scene": text,
     "sensing": text,
     "estimator": text,
     "policy": text,
-    "seed": optional(integer),
+    "seed": optional(_seed),
     "disturbances": optional(text),
     "ended": optional(text),
     "n_particles": count,

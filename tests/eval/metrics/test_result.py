@@ -8,7 +8,7 @@ import pytest
 
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.eval.metrics.result import score
-from jiggle_mj.eval.metrics.result_file import read_result
+from jiggle_mj.eval.metrics.result_file import read_result, write_result
 from jiggle_mj.limits import Limits
 from jiggle_mj.recording.estimate import EstimateWriter
 from jiggle_mj.recording.truth import write_truth
@@ -131,3 +131,9 @@ def test_a_folder_that_cannot_be_scored_is_refused_with_what_to_do(tmp_path):
             read_result(folder / "result.json")
     with pytest.raises(OutputError, match="cannot be read"):
         read_result(folder / "absent.json")
+
+
+def test_a_seed_of_any_size_can_be_read_again(tmp_path):
+    """A scene's seeds have 32 bits, and those of `--seed` no bound."""
+    write_result(tmp_path / "result.json", unscored() | {"seed": 2**64})
+    assert read_result(tmp_path / "result.json")["seed"] == 2**64
