@@ -21,8 +21,6 @@ MAX_BASELINE_M = 1.0
 """Largest baseline [m]: a stereo endoscope has 4 mm, a stereo head over a table 0.3 m."""
 EQUAL_INTRINSICS = 1e-6
 """Largest relative and absolute [px] difference of equal rectified intrinsics: a calibration file rounds its digits."""
-
-
 ORTHONORMAL = 1e-3
 """Largest difference of R^T R from the identity: calibration files print a rotation with few digits."""
 
@@ -59,7 +57,8 @@ def _check_rotation(R: Float[np.ndarray, "3 3"], where: str) -> None:
     Raises:
         ObservationError: its columns are not of unit length and at right angles, or it mirrors.
     """
-    if np.abs(R.T @ R - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(R) < 0:
+    bounded = np.abs(R).max() <= 1 + ORTHONORMAL  # products of larger numbers may overflow
+    if not bounded or np.abs(R.T @ R - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(R) < 0:
         raise ObservationError(f"{where} must be a rotation matrix; got {R.round(4).tolist()}.")
 
 

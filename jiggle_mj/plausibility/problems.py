@@ -7,6 +7,7 @@ without a word. docs/RECORDINGS.md has them as a table.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from ..camera import MAX_BASELINE_M
 from .survey import Survey
 
 REFUSED_EXTENT_M, DOUBTED_EXTENT_M = (1e-3, 10.0), (5e-3, 2.0)
@@ -24,7 +25,7 @@ DOUBTED_GAP_SHARE = 0.5
 not move together: a tool that turns or slips still pulls its own way."""
 NOISE_MULTIPLES = 3.0
 """Motion that is noise, and ratio of declared to measured noise that is doubted: three standard deviations."""
-REFUSED_BASELINE_M, DOUBTED_BASELINE_M = (1e-4, 1.0), (1e-3, 0.5)
+REFUSED_BASELINE_M, DOUBTED_BASELINE_M = (1e-4, MAX_BASELINE_M), (1e-3, 0.5)
 """Distance between the cameras [m]: a stereo endoscope has 4 to 6 mm, a wide bench rig 0.3 m; above 1 m it is a length
 in millimetres."""
 MAX_DISPARITY_SHARE = 0.5

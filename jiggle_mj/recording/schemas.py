@@ -19,9 +19,9 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from jaxtyping import Float, UInt8
 
 from ..camera import CameraCalibration, matrix_from_quaternion, rounded_quaternion
-from ..errors import RecordingError
+from ..errors import ObservationError, RecordingError
 from ..observation import IDENTITY_WXYZ, ToolState
-from ..toml_kinds import MAX_SHOWN, flag, integer, not_negative
+from ..toml_kinds import MAX_SHOWN, flag, integer, positive
 from .images import MAX_PIXELS
 from .json_values import entry, parse_object
 from .stored_arrays import MAX_LENGTH_M
@@ -147,27 +147,23 @@ def parse_calibration(message: CalibrationMessage, topic: str) -> CameraCalibrat
             f"{topic} holds numbers beyond those of a camera: D up to {MAX_DISTORTION:g}, K and P up to "
             f"{MAX_FOCAL_PX:g} px are read."
         )
-    if not _is_rotation(R.reshape(3, 3)):
-        raise RecordingError(f"{topic} has an R that is no rotation.")
     if not (K[4] > 0 and P[5] > 0 and K[8] == 1 and P[10] == 1):
         raise RecordingError(f"{topic} has no pinhole matrices: K[4], P[5] must be above 0, K[8] and P[10] must be 1.")
     if not 0 < message.width * message.height <= MAX_PIXELS:
         raise RecordingError(
             f"{topic} is of a camera of {message.width}x{message.height}; 1 to {MAX_PIXELS} pixels are read."
         )
-    return CameraCalibration(
-        width=message.width,
-        height=message.height,
-        K=K.reshape(3, 3),
-        P=P.reshape(3, 4),
-        D=D,
-        R=R.reshape(3, 3),
-    )
-
-
-def _is_rotation(R: Float[np.ndarray, "3 3"]) -> bool:
-    bounded = bool((np.abs(R) <= 1 + UNIT_LENGTH).all())
-    return bounded and np.allclose(R @ R.T, np.eye(3), rtol=0, atol=2 * UNIT_LENGTH) and bool(np.linalg.det(R) > 0)
+    try:
+        return CameraCalibration(
+            width=message.width,
+            height=message.height,
+            K=K.reshape(3, 3),
+            P=P.reshape(3, 4),
+            D=D,
+            R=R.reshape(3, 3),
+        )
+    except ObservationError as failure:
+        raise RecordingError(f"{topic}: {failure}") from failure
 
 
 def frame_transform(parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]) -> FrameTransform:
@@ -241,7 +237,7 @@ def parse_grasp(data: bytes) -> dict[str, Any]:
         return {
             "closed": entry(value, "closed", flag, GRASP),
             "grasp": entry(value, "grasp", _grasp_number, GRASP),
-            "radius": entry(value, "radius", not_negative, GRASP),
+            "radius": entry(value, "radius", positive, GRASP),
             "held_tracks": entry(value, "held_tracks", _tracks, GRASP, ()),
             "by_points": entry(value, "by_points", flag, GRASP, False),
         }
