@@ -1,9 +1,9 @@
 """The estimator's settings, and the ranges that they may have."""
 
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from jiggle_mj.argument_checks import as_choice, as_instance, as_integer, as_number, store
+from jiggle_mj.argument_checks import as_choice, as_integer, as_number, store
 from jiggle_mj.errors import OptionError
 from jiggle_mj.options import FilterName
 
@@ -12,6 +12,7 @@ from .belief.prior import PriorConfig
 from .filters.config import FilterConfig, SamplingConfig
 from .perception.config import PerceptionConfig
 from .physics.surrogate import Membrane
+from .ranges import check_parts
 
 Refinement = Literal["grasps", "frames", "end"]
 
@@ -102,6 +103,4 @@ class EstimatorConfig:
             samples=as_integer(self.samples, f"{name}.samples", at_least=1),
             seed=as_integer(self.seed, f"{name}.seed", at_least=0),
         )
-        for setting in fields(self):
-            if isinstance(setting.type, type) and is_dataclass(setting.type):
-                as_instance(getattr(self, setting.name), f"{name}.{setting.name}", setting.type)
+        check_parts(self)

@@ -1,9 +1,10 @@
-"""Ranges of settings, which every config of the estimator checks alike, and the largest number of particles."""
+"""Ranges of settings, which every config of the estimator checks alike, and the refusal of too many particles."""
 
-from jiggle_mj.errors import PerceptionError
+from dataclasses import fields, is_dataclass
 
-MAX_PARTICLES = 20_000
-"""Most particles of a sheet: the belief of more, a square matrix, does not fit a few GB."""
+from jiggle_mj.argument_checks import as_instance, as_number
+from jiggle_mj.errors import OptionError, PerceptionError
+from jiggle_mj.observation import MAX_PARTICLES
 
 
 def refuse_many_particles(n: float, cause: str) -> None:
@@ -27,12 +28,22 @@ def check_ranges(config: object, *, positive: tuple[str, ...], shares: tuple[str
     """Check that the named fields of a config are positive, or lie between 0 and 1.
 
     Raises:
-        ValueError: a field is out of its range.
+        OptionError: a field is no number, or out of its range.
     """
     name = type(config).__name__
     for key in positive:
-        if not (value := getattr(config, key)) > 0:
-            raise ValueError(f"{name}.{key} must be above 0; got {value}.")
+        as_number(getattr(config, key), f"{name}.{key}", above=0)
     for key in shares:
-        if not 0 <= (value := getattr(config, key)) <= 1:
-            raise ValueError(f"{name}.{key} must lie between 0 and 1; got {value}.")
+        if not 0 <= (value := as_number(getattr(config, key), f"{name}.{key}")) <= 1:
+            raise OptionError(f"{name}.{key} must lie between 0 and 1; got {value}.")
+
+
+def check_parts(config: object) -> None:
+    """Check that each nested config of a config is of its own type.
+
+    Raises:
+        OptionError: one is not.
+    """
+    for part in fields(config):  # pyright: ignore[reportArgumentType]
+        if isinstance(part.type, type) and is_dataclass(part.type):
+            as_instance(getattr(config, part.name), f"{type(config).__name__}.{part.name}", part.type)

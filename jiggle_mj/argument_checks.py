@@ -79,6 +79,8 @@ def as_array(
         raise error(f"{where} must be {allowed}; got {quoted(array if array.ndim else value)}.")
     if kind == "numbers" and array.dtype.kind != "f":
         array = array.astype(float)
+    if kind == "whole numbers" and array.dtype.kind == "u":
+        array = array.astype(np.int64)  # differences of unsigned numbers are never below 0
     if finite and kind == "numbers" and not np.isfinite(array).all():
         raise error(f"{where} must hold finite numbers only; {_first_not_finite(array)}.")
     return array

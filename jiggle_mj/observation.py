@@ -23,6 +23,8 @@ from .errors import ObservationError, OptionError
 
 IDENTITY_WXYZ = np.array([1.0, 0.0, 0.0, 0.0])
 """Quaternion wxyz of the identity rotation."""
+MAX_PARTICLES = 20_000
+"""Most particles of a sheet: the belief of more, a square matrix, does not fit a few GB."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,10 @@ Limits against rounding are constants of the files that need them.
 
 from dataclasses import dataclass, field
 
+from jiggle_mj.argument_checks import as_integer, as_number
+
+from ..ranges import check_parts, check_ranges
+
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerConfig:
@@ -23,11 +27,10 @@ class SamplerConfig:
     the 0.5 above which a particle is called attached."""
 
     def __post_init__(self) -> None:
+        """Check types and ranges."""
         for name in ("candidates", "pending_updates", "sweeps_per_round"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"SamplerConfig.{name} must be at least 1; got {getattr(self, name)}.")
-        if not self.agreement > 0:
-            raise ValueError(f"SamplerConfig.agreement must be positive; got {self.agreement:g}.")
+            as_integer(getattr(self, name), f"SamplerConfig.{name}", at_least=1)
+        check_ranges(self, positive=("agreement",))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +56,9 @@ class BeliefConfig:
     """Settings of `AttachmentBelief.sampled` and `AttachmentBelief.mode`."""
 
     def __post_init__(self) -> None:
-        for name in ("damping", "learning_rate"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"BeliefConfig.{name} must be in (0, 1]; got {getattr(self, name):g}.")
-        if not self.mesh_transfer >= 0:
-            raise ValueError(f"BeliefConfig.mesh_transfer must not be negative; got {self.mesh_transfer:g}.")
-        if not 0 < self.open_above <= 1:
-            raise ValueError(f"BeliefConfig.open_above must be in (0, 1]; got {self.open_above:g}.")
-        if not 0 < self.tail < 0.5:
-            raise ValueError(f"BeliefConfig.tail must be in (0, 0.5); got {self.tail:g}.")
+        """Check types and ranges."""
+        shares = ("damping", "learning_rate", "open_above")
+        check_ranges(self, positive=shares, shares=shares)
+        as_number(self.mesh_transfer, "BeliefConfig.mesh_transfer", at_least=0)
+        as_number(self.tail, "BeliefConfig.tail", above=0, below=0.5)
+        check_parts(self)

@@ -6,7 +6,7 @@ the top of the file that uses them.
 
 from dataclasses import dataclass, field, fields
 
-from ..ranges import check_ranges
+from ..ranges import check_parts, check_ranges
 
 MIN_POINTS = 20
 """Fewest points that make a sheet: about 4 x 5, of which 6 lie inside."""
@@ -144,6 +144,7 @@ class StereoTrackerConfig:
         nested = ("registration", "mesh")
         positive = tuple(item.name for item in fields(self) if item.name not in (*shares, *nested))
         check_ranges(self, positive=positive, shares=shares)
+        check_parts(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,3 +213,7 @@ class PerceptionConfig:
     """Points with identities."""
     clouds: CloudTrackerConfig = field(default_factory=CloudTrackerConfig)
     """Clouds without identities."""
+
+    def __post_init__(self) -> None:
+        """Check the types."""
+        check_parts(self)

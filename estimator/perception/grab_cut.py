@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from jiggle_mj.argument_checks import as_number
 from jiggle_mj.errors import PerceptionError
 
 MAX_PIXELS = 80_000
@@ -26,8 +27,7 @@ class GrabCut:
 
     def __post_init__(self) -> None:
         """Check the range."""
-        if not 0 < self.centre_share < 1:
-            raise ValueError(f"GrabCut.centre_share must lie between 0 and 1; got {self.centre_share}.")
+        as_number(self.centre_share, "GrabCut.centre_share", above=0, below=1)
 
     def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Bool[np.ndarray, "height width"]:
         """Return the tissue pixels of an RGB image."""

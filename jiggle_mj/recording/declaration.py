@@ -14,7 +14,7 @@ import numpy as np
 from mcap.records import Attachment
 
 from ..errors import RecordingError
-from ..observation import Declaration, DeclaredMesh
+from ..observation import MAX_PARTICLES, Declaration, DeclaredMesh
 from ..toml_kinds import MAX_COUNT, flag, number, positive, shown, vector
 from .json_values import entry, parse_object
 from .mcap_files import McapOutput, read_arrays
@@ -35,8 +35,6 @@ KINDS = {
     "bed": flag,
 }
 """Kind of each field of a declaration but its mesh."""
-MAX_VERTICES = 20_000
-"""Most vertices of a declared mesh: a belief of more does not fit 2 GB, and a length in a wrong unit is refused."""
 IDENTITY_DIGITS = 16
 """Hexadecimal digits of an identity: 64 bits, so that no two of a million recordings are likely to share one."""
 
@@ -108,8 +106,8 @@ def with_mesh(declaration: Declaration, attachment: Attachment, path: Path) -> D
         )
     vertices = arrays.positions("vertices", (None, 3), finite=True)
     n = len(vertices)
-    if n > MAX_VERTICES:
-        raise RecordingError(f"{path}: the declared mesh has {n} vertices; at most {MAX_VERTICES} can be estimated.")
+    if n > MAX_PARTICLES:
+        raise RecordingError(f"{path}: the declared mesh has {n} vertices; at most {MAX_PARTICLES} can be estimated.")
     mesh = DeclaredMesh(
         vertices=vertices,
         faces=arrays.indices("faces", (None, 3), below=n),

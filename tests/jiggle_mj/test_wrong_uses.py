@@ -47,6 +47,11 @@ def test_lists_and_whole_numbers_stand_for_arrays_of_numbers():
     np.testing.assert_array_equal(positions, [[0.0, 0.0, 1.0], [1.0, 2.0, 3.0]])
 
 
+def test_unsigned_whole_numbers_become_signed():
+    """A difference of unsigned numbers is never below 0."""
+    assert as_array(np.array([1, 2], np.uint8), "ids", (2,), kind="whole numbers").dtype == np.int64
+
+
 def test_an_array_that_is_right_is_not_copied():
     right = np.zeros((5, 3), np.float32)
     assert as_array(right, "x", (None, 3)) is right

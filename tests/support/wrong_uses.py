@@ -14,6 +14,8 @@ import numpy as np
 
 import jiggle_mj as jm
 from jiggle_mj.cluster import cluster
+from jiggle_mj.estimator.belief.config import BeliefConfig, SamplerConfig
+from jiggle_mj.estimator.perception.config import PerceptionConfig, StereoTrackerConfig
 from jiggle_mj.scenes import disturbed
 
 POSE = np.eye(4)
@@ -27,6 +29,8 @@ CALIBRATION = {"width": 32, "height": 24, "K": K, "P": P}
 POINTS = np.random.default_rng(0).normal(size=(5, 3))
 SMALL = jm.Scene(name="small")
 
+ABOVE_ZERO = (0, -1e-3, NAN, INF, "5 mm", 10**400, None, [5e-3])
+"""Values that are no number above 0."""
 Use = tuple[str, Callable[[], object]]
 """What is tried, and the call."""
 
@@ -51,27 +55,26 @@ def changed(name: str, make: Callable[..., object], good: dict, wrong: dict[str,
 def constructors() -> Iterator[Use]:
     """Yield wrong arguments of actions, observations, meshes, declarations and cameras."""
     three = ([0, 0], np.zeros((1, 3)), "origin", None, [0, 0, NAN], [0, 0, "1 mm"])
-    above_zero = (0, -1e-3, NAN, INF, "5 mm", 10**400, None, [5e-3])
     yield from changed(
-        "Grasp", jm.Grasp, {"point": np.zeros(3), "radius": 5e-3}, {"point": three, "radius": above_zero}
+        "Grasp", jm.Grasp, {"point": np.zeros(3), "radius": 5e-3}, {"point": three, "radius": ABOVE_ZERO}
     )
     yield from changed("Move", jm.Move, {}, {"to": three})
     path = ([], [[0, 0, 0]], [0, 0], [[0, NAN]], "line", None)
-    yield from changed("Cut", jm.Cut, {"path": [[0, 0]], "width": 0.01}, {"path": path, "width": above_zero})
+    yield from changed("Cut", jm.Cut, {"path": [[0, 0]], "width": 0.01}, {"path": path, "width": ABOVE_ZERO})
     sewn = {"path": [[0, 0]], "width": 0.01, "stiffness": 1.0}
-    yield from changed("Suture", jm.Suture, sewn, {"path": path[:2], "stiffness": above_zero})
+    yield from changed("Suture", jm.Suture, sewn, {"path": path[:2], "stiffness": ABOVE_ZERO})
     image = (None, RGB.astype(float), RGB.astype(np.uint16), RGB[..., 0], RGB[:, :10], RGB[:0], "left.png")
     yield from changed("StereoPair", jm.StereoPair, {"left": RGB, "right": RGB}, {"left": image, "right": image[:2]})
     positions = (None, POINTS[:, :2], POINTS.ravel(), [["a", "b", "c"]], [[0, 0], [0, 0, 0]], POINTS.astype(complex))
     ids = ([0, 1], [0, 1, 2, 3, 3], np.arange(5.0), "01234", [[0, 1, 2, 3, 4]])
-    wrong = {"positions": positions, "track_id": ids, "sd": above_zero}
+    wrong = {"positions": positions, "track_id": ids, "sd": ABOVE_ZERO}
     yield from changed("MeasuredPoints", jm.MeasuredPoints, {"positions": POINTS}, wrong)
     wrong = {
         "position": three,
         "quat_wxyz": ([0, 0, 0, 0], [1, 0, 0], [NAN, 0, 0, 0], None),
         "closed": ("yes", 1, None),
         "grasp": (-1, 1.5, "first", None, True),
-        "radius": above_zero,
+        "radius": ABOVE_ZERO,
         "held_tracks": ("12", 3, [1.5], None),
         "by_points": ("no", None),
     }
@@ -94,8 +97,8 @@ def constructors() -> Iterator[Use]:
     }
     yield from changed("DeclaredMesh", jm.DeclaredMesh, TRIANGLE, wrong)
     wrong = {
-        "membrane_stiffness": above_zero,
-        "thickness": above_zero[:6],
+        "membrane_stiffness": ABOVE_ZERO,
+        "thickness": ABOVE_ZERO[:6],
         "poisson": (0.5, -0.1, NAN, "0.4", None),
         "gravity": (-9.81, (0, 0), (0, 0, NAN), "down", None),
         "bed": ("yes", None),
@@ -104,7 +107,7 @@ def constructors() -> Iterator[Use]:
     yield from changed("Declaration", jm.Declaration, {}, wrong)
     mirrored, skewed = np.diag([1.0, 1, -1, 1]), POSE + np.eye(4, k=1)
     pose = (None, np.eye(3), POSE * NAN, mirrored, skewed, "world")
-    wrong = {"width": (0, 32.0, None), "focal": above_zero, "baseline": above_zero, "T_world_camera": pose}
+    wrong = {"width": (0, 32.0, None), "focal": ABOVE_ZERO, "baseline": ABOVE_ZERO, "T_world_camera": pose}
     yield from changed("StereoCamera.rectified", jm.StereoCamera.rectified, CAMERA, wrong)
     wrong = {
         "height": (-1, "24", True),
@@ -166,6 +169,13 @@ def engines(folder: Path) -> Iterator[Use]:
         "prior": (1,),
     }
     yield from changed("EstimatorConfig", jm.EstimatorConfig, {}, wrong)
+    for config, wrong in (
+        (PerceptionConfig, {"stereo": ({}, 3)}),
+        (StereoTrackerConfig, {"min_depth": ABOVE_ZERO, "min_found": (-1, 2, "most"), "mesh": (None,)}),
+        (BeliefConfig, {"damping": (0, 1.5, "much"), "tail": (0.5, None), "sampler": ({},)}),
+        (SamplerConfig, {"candidates": (0, 1.5, "16"), "agreement": (0, "0.1")}),
+    ):
+        yield from changed(config.__name__, config, {}, wrong)
     for given in (None, "run.mcap", [observation()], POINTS, SimpleNamespace(index=0, tool=None)):
         yield f"update({str(given)[:30]})", lambda given=given: jm.Estimator(jm.Declaration()).update(given)
     yield (
