@@ -10,8 +10,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from jiggle_mj.errors import MaskError, OptionError, PerceptionError
+from jiggle_mj.errors import MaskError, OptionError, PerceptionError, RecordingError
 from jiggle_mj.estimator.perception import FrameMask, GrabCut, TissueMask
+from jiggle_mj.recording.images import MAX_PIXELS
+from jiggle_mj.recording.npz_arrays import MALFORMED, read_npz
 
 SHOWN = "mask.png"
 """File that shows what a segmentation in doubt took for tissue."""
@@ -92,7 +94,7 @@ def mask_named(name: str) -> TissueMask | FrameMask:
         raise OptionError(f"--mask {name}: no such file; give an image, a .npy, a .npz, a folder, or {GRABCUT}.")
     try:
         return _arrays(path) if path.suffix in (".npy", ".npz") else RestMask(tissue=read_mask(path))
-    except (PerceptionError, OSError, ValueError, KeyError, MemoryError, EOFError) as failure:
+    except (PerceptionError, RecordingError, *MALFORMED) as failure:
         raise OptionError(f"--mask {name} cannot be read: {failure}") from failure
 
 
@@ -119,10 +121,17 @@ def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
     """Return the pixels of an image that are brighter than half.
 
     Raises:
-        PerceptionError: it is no image.
+        PerceptionError: it is no image, cannot be read, or has more than `MAX_PIXELS`.
     """
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if len(content) else None
+    try:
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+        image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if len(content) else None
+    except OSError as failure:
+        raise PerceptionError(f"{path} cannot be read: {failure.strerror}.") from failure
+    except cv2.error:  # more pixels than OpenCV reads
+        image = None
+    if image is not None and image.size > MAX_PIXELS:
+        raise PerceptionError(f"{path} has {image.size} pixels; at most {MAX_PIXELS} are read.")
     if image is None:
         raise PerceptionError(f"{path} is no image that OpenCV reads; give a PNG, white where tissue is.")
     return image > WHITE
@@ -130,18 +139,18 @@ def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
 
 def _arrays(path: Path) -> FrameMask:
     """Return the masks of a .npy (height, width) or of a .npz with `left` and `right` (frames, height, width)."""
-    loaded = np.load(path, allow_pickle=False, mmap_mode="r")
-    if isinstance(loaded, np.ndarray):
-        if loaded.ndim != 2:
-            raise ValueError(f"the array has the shape {loaded.shape}; it must be (height, width).")
-        return RestMask(tissue=np.asarray(loaded) > 0)
-    with loaded:
-        sizes = [entry.file_size for entry in loaded.zip.infolist()] if loaded.zip is not None else []
-        if sum(sizes) > MAX_BYTES:
-            raise ValueError(f"it holds {sum(sizes)} bytes; at most {MAX_BYTES} are read: give a folder of images.")
-        if missing := {"left", "right"} - set(loaded.files):
-            raise ValueError(f"it lacks the array '{min(missing)}'; left and right (frames, height, width) are needed.")
-        left, right = (np.asarray(loaded[name]) > 0 for name in ("left", "right"))
+    if path.suffix == ".npy":
+        array = np.load(path, allow_pickle=False, mmap_mode="r")
+        if not isinstance(array, np.ndarray) or array.ndim != 2 or array.size > MAX_PIXELS:
+            shape = getattr(array, "shape", "none")
+            raise ValueError(f"the array has the shape {shape}; it must be (height, width) of at most {MAX_PIXELS}.")
+        return RestMask(tissue=np.asarray(array > 0))
+    if path.stat().st_size > MAX_BYTES:
+        raise ValueError(f"it has more than {MAX_BYTES} bytes: give a folder of images.")
+    arrays = read_npz(path.read_bytes(), limit=MAX_BYTES)
+    if missing := {"left", "right"} - set(arrays):
+        raise ValueError(f"it lacks the array '{min(missing)}'; left and right (frames, height, width) are needed.")
+    left, right = (arrays[name] > 0 for name in ("left", "right"))
     if left.ndim != 3 or right.ndim != 3:
         raise ValueError(f"left and right have the shapes {left.shape} and {right.shape}; (frames, height, width) are.")
     return ArrayMask(left=left, right=right)

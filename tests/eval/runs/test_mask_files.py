@@ -8,7 +8,7 @@ import pytest
 
 from jiggle_mj.errors import MaskError, OptionError, PerceptionError
 from jiggle_mj.estimator import Estimator
-from jiggle_mj.estimator.perception import GrabCut, StereoTracker
+from jiggle_mj.estimator.perception import FrameMask, GrabCut, StereoTracker
 from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
 from jiggle_mj.observation import Declaration, Observation, StereoPair
 from tests.support.perception_plane import HEIGHT, WIDTH, PlaneSheet, camera, stereo
@@ -62,13 +62,13 @@ def test_grey_images_need_a_mask(tmp_path):
     (tmp_path / "all").mkdir()
     for side in ("left", "right"):
         cv2.imwrite(str(tmp_path / "all" / f"{side}_000000.png"), inside)
-    sheets = [
-        StereoTracker(camera(), mask=mask_named(str(tmp_path / name))).start(grey, tool())
-        for name in ("mask.png", "mask.npy", "mask.npz", "all")
-    ]
-    of_one_image, of_both_images = sheets[:2], sheets[2:]
-    for first, second in (of_one_image, of_both_images):
-        np.testing.assert_array_equal(first.rest, second.rest)
+    for name, right in (("mask.png", 255), ("mask.npy", 255), ("mask.npz", inside), ("all", inside)):
+        mask = mask_named(str(tmp_path / name))
+        assert isinstance(mask, FrameMask)
+        np.testing.assert_array_equal(mask.at(0, "left", rest=True), inside > 0)
+        np.testing.assert_array_equal(mask.at(0, "right", rest=True), np.broadcast_to(right, inside.shape) > 0)
+    tracker = StereoTracker(camera(), mask=mask_named(str(tmp_path / "mask.npz")))
+    assert len(tracker.start(grey, tool()).rest) > 0
 
 
 def test_the_estimator_takes_the_mask_of_a_file(tmp_path):
@@ -88,7 +88,12 @@ def test_a_mask_that_cannot_be_used_is_refused_by_name(tmp_path):
     np.savez(tmp_path / "one.npz", left=np.zeros((1, 2, 2), bool))
     np.save(tmp_path / "line.npy", np.zeros(3))
     (tmp_path / "empty").mkdir()
+    np.savez(tmp_path / "cut.npz", left=np.zeros((9, 9, 9), bool))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "cut.npz").read_bytes()[:200])
+    (tmp_path / "text.npy").write_text("no array")
     for name, why in (
+        ("cut.npz", "is not an npz of arrays"),
+        ("text.npy", "cannot be read"),
         ("none.png", "no such file"),
         ("text.png", "is no image"),
         ("one.npz", "lacks the array 'right'"),
