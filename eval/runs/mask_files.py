@@ -15,8 +15,8 @@ from jiggle_mj.estimator.perception import FrameMask, GrabCut, TissueMask
 from jiggle_mj.recording.images import MAX_PIXELS
 from jiggle_mj.recording.npz_arrays import MALFORMED, read_npz
 
-SHOWN = "mask.png"
-"""File that shows what a segmentation in doubt took for tissue."""
+SHOWN = "doubtful_mask.png"
+"""File that shows what a segmentation in doubt took for tissue; not the name of a mask that a user draws."""
 GRABCUT = "grabcut"
 """Name that stands for `GrabCut` in place of a file."""
 WHITE = 127
@@ -100,7 +100,7 @@ def mask_named(name: str) -> TissueMask | FrameMask:
 
 @contextmanager
 def mask_shown(folder: Path) -> Iterator[None]:
-    """Write what a segmentation in doubt took for tissue to FOLDER/mask.png, and name it in the error.
+    """Write what a segmentation in doubt took for tissue to FOLDER/doubtful_mask.png, and name it in the error.
 
     Raises:
         PerceptionError: the segmentation is in doubt.

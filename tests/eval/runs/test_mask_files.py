@@ -9,7 +9,7 @@ import pytest
 from jiggle_mj.errors import MaskError, OptionError, PerceptionError
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.perception import FrameMask, GrabCut, StereoTracker
-from jiggle_mj.eval.runs.mask_files import mask_named, mask_shown
+from jiggle_mj.eval.runs.mask_files import SHOWN, mask_named, mask_shown
 from jiggle_mj.observation import Declaration, Observation, StereoPair
 from tests.support.perception_plane import HEIGHT, WIDTH, PlaneSheet, camera, stereo
 from tests.support.recordings import tool
@@ -34,9 +34,9 @@ def test_a_table_is_not_taken_for_the_sheet(tmp_path, at_border):
     picture, sheet = table_with_a_sheet(at_border=at_border)
     with pytest.raises(PerceptionError, match="Is it the table") as refused, mask_shown(tmp_path / "out"):
         StereoTracker(camera()).start(StereoPair(left=picture, right=picture), tool())
-    shown = cv2.imread(str(tmp_path / "out" / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    shown = cv2.imread(str(tmp_path / "out" / SHOWN), cv2.IMREAD_GRAYSCALE)
     assert shown is not None
-    assert "mask.png" in str(refused.value)
+    assert SHOWN in str(refused.value)
     assert (shown > 0)[:5, :5].all()
     assert not (shown > 0)[150, 200]
     found = GrabCut()(picture)
