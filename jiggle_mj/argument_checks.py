@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from jaxtyping import Shaped
 
-from .errors import JiggleError, OptionError
+from .errors import MAX_SHOWN, JiggleError, OptionError
 from .likely_name import did_you_mean
 
 T = TypeVar("T")
@@ -23,12 +23,10 @@ Kind = Literal["numbers", "whole numbers", "booleans", "uint8"]
 """What an array holds."""
 DTYPE_KINDS: dict[Kind, str] = {"numbers": "fiu", "whole numbers": "iu", "booleans": "b", "uint8": "u"}
 """Kinds of NumPy data types that pass as each; whole numbers pass as numbers."""
-LONGEST_QUOTE = 200
-"""Longest quote of a wrong value in a message [characters]."""
 
 
 def quoted(value: object) -> str:
-    """Return a wrong value for a message, at most `LONGEST_QUOTE` characters long: an array by its type and shape."""
+    """Return a wrong value for a message, at most `MAX_SHOWN` characters long: an array by its type and shape."""
     if isinstance(value, np.ndarray) and (value.ndim != 1 or value.size > 4):
         return f"an array of {value.dtype} {value.shape}"
     try:
@@ -36,7 +34,7 @@ def quoted(value: object) -> str:
     except Exception:
         text = f"a {type(value).__name__}"
     text = " ".join(text.split())
-    return text if len(text) <= LONGEST_QUOTE else f"{text[: LONGEST_QUOTE - 3]}..."
+    return text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN - 3]}..."
 
 
 def as_array(

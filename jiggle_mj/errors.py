@@ -6,6 +6,9 @@ Wrong arguments raise `ValueError`; every class here is a `JiggleError`, which t
 import numpy as np
 from jaxtyping import Bool
 
+MAX_SHOWN = 200
+"""Most characters of a wrong input that an error quotes."""
+
 
 class JiggleError(Exception):
     """Base of the errors that a user can correct: the message says what was given, what is allowed, what to do."""

@@ -6,11 +6,9 @@ from difflib import get_close_matches
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from .errors import OptionError
+from .errors import MAX_SHOWN, OptionError
 
 T = TypeVar("T")
-MAX_SHOWN = 200
-"""Most characters of an input that a message quotes."""
 
 
 def with_settings(config: T, table: Mapping[str, Any], *, where: str) -> T:

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .errors import RecordingError
+from .errors import MAX_SHOWN, RecordingError
 
-MAX_SHOWN = 200
-"""Most characters of a wrong value that an error quotes."""
 MAX_COUNT = (1 << 31) - 1
 """Largest whole number: signed 32 bits, in which recordings store numbers of points and grasps."""
 REQUIRED = object()

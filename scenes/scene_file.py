@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from jiggle_mj.argument_checks import as_path
-from jiggle_mj.errors import SceneError
+from jiggle_mj.errors import MAX_SHOWN, SceneError
 from jiggle_mj.likely_name import did_you_mean
-from jiggle_mj.toml_kinds import MAX_SHOWN, shown
+from jiggle_mj.toml_kinds import shown
 
 from .disturbances.registry import disturbance_class
 from .scene.attachments import SHAPES, Attachment

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import OptionError
-from ..nested_settings import MAX_SHOWN, nested, with_settings
+from ..errors import MAX_SHOWN, OptionError
+from ..nested_settings import nested, with_settings
 from ..options import FilterName
 
 if TYPE_CHECKING:

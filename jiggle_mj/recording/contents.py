@@ -17,9 +17,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from ..actions import Cut, Suture
-from ..errors import RecordingError
+from ..errors import MAX_SHOWN, RecordingError
 from ..observation import Declaration
-from ..toml_kinds import MAX_SHOWN
 from .bag_refusal import refuse_bag
 from .declaration import DECLARATION, DECLARED_MESH, METADATA, parse_declaration, with_mesh
 from .events import parse_event

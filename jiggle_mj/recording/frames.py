@@ -12,8 +12,7 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from jaxtyping import Float
 
 from ..camera import StereoCamera
-from ..errors import RecordingError
-from ..toml_kinds import MAX_SHOWN
+from ..errors import MAX_SHOWN, RecordingError
 from .schemas import CAMERA_FRAMES, WORLD, frame_transform, parse_transform
 
 MAX_STATIC_CHANGE = 1e-6

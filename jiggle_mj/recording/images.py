@@ -8,8 +8,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from jaxtyping import Shaped, UInt8
 
-from ..errors import RecordingError
-from ..toml_kinds import MAX_SHOWN
+from ..errors import MAX_SHOWN, RecordingError
 
 MAX_PIXELS = 50_000_000
 """Most pixels of an image: more than any camera's that a stereo estimate can use, and 150 MB decoded."""

@@ -28,7 +28,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import MCAP0_MAGIC, Writer
 from mcap_protobuf.schema import register_schema
 
-from ..errors import OutputError, RecordingError
+from ..errors import MAX_SHOWN, OutputError, RecordingError
 from .chunks import chunk_records
 from .npz_arrays import read_npz
 from .output_files import PartialFile, partial_path
@@ -38,8 +38,6 @@ RECORD_HEADER = struct.Struct("<BQ")
 """Opcode and length that precede every MCAP record."""
 DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, OverflowError, MemoryError)
 """Exceptions that a damaged record raises: mcap's errors, wrong checksums, wrong lengths, broken compression."""
-MAX_SHOWN = 200
-"""Most characters of a damaged file's content that an error quotes."""
 MAX_RECORD_BYTES = 1 << 30
 """Largest record [byte]: 1 GiB, four times the largest chunk; attachments may be that large."""
 MAX_TIME_NS = (1 << 63) - 1

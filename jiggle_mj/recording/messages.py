@@ -9,8 +9,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Message, Metadata
 
-from ..errors import RecordingError
-from ..toml_kinds import MAX_SHOWN
+from ..errors import MAX_SHOWN, RecordingError
 from .mcap_files import MAX_TIME_NS, iterate_records
 
 Parsed = TypeVar("Parsed")

@@ -19,9 +19,9 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from jaxtyping import Float, UInt8
 
 from ..camera import CameraCalibration, matrix_from_quaternion, rounded_quaternion
-from ..errors import ObservationError, RecordingError
+from ..errors import MAX_SHOWN, ObservationError, RecordingError
 from ..observation import IDENTITY_WXYZ, ToolState
-from ..toml_kinds import MAX_SHOWN, flag, integer, positive
+from ..toml_kinds import flag, integer, positive
 from .images import MAX_PIXELS
 from .json_values import entry, parse_object
 from .stored_arrays import MAX_LENGTH_M

@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from jiggle_mj.argument_checks import LONGEST_QUOTE, as_array, as_integer, as_number, quoted
-from jiggle_mj.errors import ObservationError, OptionError
+from jiggle_mj.argument_checks import as_array, as_integer, as_number, quoted
+from jiggle_mj.errors import MAX_SHOWN, ObservationError, OptionError
 from jiggle_mj.likely_name import did_you_mean
 from jiggle_mj.observation import MeasuredPoints
 from tests.support.sources import ROOT
@@ -35,7 +35,7 @@ def test_every_refusal_is_one_short_line(outcomes: list[list[str]]):
     """Twice the longest quote leaves room for what is allowed; a list of all scenes or disturbances takes more."""
     for name, _, message in outcomes:
         assert message and "\n" not in message, name
-        assert len(message) <= 2 * LONGEST_QUOTE or "There are" in message or "Shipped scenes" in message, (
+        assert len(message) <= 2 * MAX_SHOWN or "There are" in message or "Shipped scenes" in message, (
             name,
             message,
         )
@@ -71,7 +71,7 @@ def test_numbers_of_numpy_are_numbers_and_booleans_are_none():
 
 
 def test_a_long_value_is_quoted_in_part():
-    assert len(quoted("a" * 10_000)) == LONGEST_QUOTE
+    assert len(quoted("a" * 10_000)) == MAX_SHOWN
     assert quoted(np.zeros((480, 640))) == "an array of float64 (480, 640)"
 
 
