@@ -143,9 +143,9 @@ def test_settings_of_speed_do_not_change_the_draws(setting):
 
 
 def test_sampler_settings_outside_of_their_range_are_refused():
-    with pytest.raises(ValueError, match=r"SamplerConfig\.candidates must be at least 1; got 0"):
+    with pytest.raises(ValueError, match=r"SamplerConfig\.candidates = 0: must be an integer of at least 1"):
         SamplerConfig(candidates=0)
-    with pytest.raises(ValueError, match=r"SamplerConfig\.agreement must be positive"):
+    with pytest.raises(ValueError, match=r"SamplerConfig\.agreement must be above 0"):
         SamplerConfig(agreement=0.0)
 
 
