@@ -111,6 +111,14 @@ def positive(value: Any) -> float:
     return real
 
 
+def not_negative(value: Any) -> float:
+    """Return a finite number of at least 0."""
+    real = _finite(value, "a number from 0")
+    if not real >= 0:
+        raise TypeError("a number from 0")
+    return real
+
+
 def integer(value: Any) -> int:
     """Return an integer that fits 32 bits; a float that is whole counts, as some writers of JSON know no others."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_COUNT or value % 1:

@@ -36,15 +36,15 @@ def perception(config: PerceptionConfig, *, with_camera: bool = False) -> Percep
 @pytest.mark.parametrize(
     ("config", "field", "value", "message"),
     [
-        (RegistrationConfig, "fine_window", 0.0, "fine_window must be above 0; got 0.0"),
+        (RegistrationConfig, "fine_window", 0.0, "fine_window must be above 0 and finite; got 0.0"),
         (RegistrationConfig, "min_correlation", 1.5, "min_correlation must lie between 0 and 1; got 1.5"),
         (RegistrationConfig, "contrast_width", 26, "contrast_width must be odd; got 26"),
-        (SheetMeshConfig, "min_particles", 0, "min_particles must be above 0; got 0"),
+        (SheetMeshConfig, "min_particles", 0, "min_particles must be above 0 and finite; got 0"),
         (SheetMeshConfig, "min_matched", -0.1, "min_matched must lie between 0 and 1; got -0.1"),
-        (StereoTrackerConfig, "lateral_sd", float("nan"), "lateral_sd must be above 0; got nan"),
+        (StereoTrackerConfig, "lateral_sd", float("nan"), "lateral_sd must be above 0 and finite; got nan"),
         (StereoTrackerConfig, "min_found", 2, "min_found must lie between 0 and 1; got 2"),
-        (PointTrackerConfig, "outlier_ratio", -1.0, "outlier_ratio must be above 0; got -1.0"),
-        (CloudTrackerConfig, "sweeps", 0, "sweeps must be above 0; got 0"),
+        (PointTrackerConfig, "outlier_ratio", -1.0, "outlier_ratio must be above 0 and finite; got -1.0"),
+        (CloudTrackerConfig, "sweeps", 0, "sweeps must be above 0 and finite; got 0"),
     ],
 )
 def test_settings_out_of_range_are_refused_by_name(config, field, value, message):
