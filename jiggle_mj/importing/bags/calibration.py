@@ -13,14 +13,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from ...camera import CameraCalibration, StereoCamera
+from ...camera import MAX_BASELINE_M, CameraCalibration, StereoCamera
 from ...errors import RecordingError
 from ...recording.frames import transform_of_rotation
 
 MODELS = ("plumb_bob", "rational_polynomial")
 """Distortion models that are read; with coefficients of zero every model is none."""
-MAX_BASELINE = 2.0
-"""Longest baseline that is read [m]; a longer one is in millimetres."""
 MAX_ROTATION_ERROR = 1e-3
 """Largest entry of R R^T - 1 of a rotation: a calibration file's rounding to four digits."""
 BASELINE_AGREEMENT = 0.05
@@ -32,7 +30,9 @@ class CameraSource:
     """What a bag or a file says of one camera."""
 
     calibration: CameraCalibration
-    """The calibration, with its own P, or [K 0] where P is missing or zero."""
+    """The calibration; its P is K where none is given."""
+    has_P: bool
+    """Whether P is given, and not zero."""
     frame: str
     """Name of the optical frame; empty for a file."""
     where: str
@@ -114,7 +114,7 @@ def stereo_camera(
     notes: list[str] = []
     unsure = False
     pair = (left.calibration, right.calibration)
-    baseline = _baseline(*pair)
+    baseline = _baseline(*pair) if left.has_P and right.has_P else None
     if baseline is None:
         if T_left_right is None:
             raise RecordingError(
@@ -141,9 +141,9 @@ def stereo_camera(
             )
     elif baseline < 0:
         baseline, unsure = -baseline, True
-    if baseline is None or not 0 < baseline <= MAX_BASELINE:
+    if baseline is None or not 0 < baseline <= MAX_BASELINE_M:
         raise RecordingError(
-            f"the baseline is {baseline or 0:.4g} m (P[0,3] of {right.where} over fx); up to {MAX_BASELINE:g} m is "
+            f"the baseline is {baseline or 0:.4g} m (P[0,3] of {right.where} over fx); up to {MAX_BASELINE_M:g} m is "
             "read. Is P in millimetres?"
         )
     left_calibration, right_calibration = _pair_along_x(*pair, baseline)
@@ -167,6 +167,7 @@ def _source(
     K, D, R, P = numbers
     R = R if R.any() else np.eye(3).ravel()
     P = P if P.size else np.zeros(12)
+    has_P = bool(P[0] > 0)
     if (K.size, R.size, P.size) != (9, 9, 12):
         raise RecordingError(f"{where}: K, R, P have {K.size}, {R.size}, {P.size} numbers; they must have 9, 9, 12.")
     if not all(np.isfinite(each).all() for each in (K, D, R, P)):
@@ -190,10 +191,11 @@ def _source(
             width=width,
             height=height,
             K=K.reshape(3, 3),
-            P=P.reshape(3, 4) if P[0] > 0 else np.hstack([K.reshape(3, 3), np.zeros((3, 1))]),
+            P=P.reshape(3, 4) if has_P else np.hstack([K.reshape(3, 3), np.zeros((3, 1))]),
             D=_padded(D),
             R=R.reshape(3, 3),
         ),
+        has_P=has_P,
         frame=frame,
         where=where,
     )
@@ -207,10 +209,9 @@ def _padded(D: Float[np.ndarray, " d"]) -> Float[np.ndarray, " e"]:
 
 def _baseline(left: CameraCalibration, right: CameraCalibration) -> float | None:
     """Return the baseline [m] that two P give; None where they give none. Either camera may be the reference."""
-    fx_left, fx_right = left.P[0, 0], right.P[0, 0]
     if left.P[0, 3] == right.P[0, 3] == 0:
         return None
-    return float(left.P[0, 3] / fx_left - right.P[0, 3] / fx_right)
+    return float(left.P[0, 3] / left.P[0, 0] - right.P[0, 3] / right.P[0, 0])
 
 
 def _pair_along_x(
