@@ -81,7 +81,7 @@ def read_reports(folder: DataFolder, given: MeasuredRecording, tool: ReportedToo
         positions=positions * unit @ frame.rotation.T + frame.translation,
         orientations=Slerp(times, rotations),
     )
-    _refuse_outside(reports, clock)
+    _refuse_outside(reports, tool, clock)
     return reports
 
 
@@ -101,7 +101,7 @@ def _times(
     times = [time + shift for time in absolute]
     limit = np.iinfo(np.int64).max // 4
     if max(-times[0], times[-1]) > limit:
-        raise RecordingError(_apart(times, clock))
+        raise RecordingError(_apart(times, tool, clock))
     return np.array(times, np.int64)
 
 
@@ -120,19 +120,20 @@ def _turns(folder: DataFolder, given: MeasuredRecording, tool: ReportedTool, cou
     return Rotation.from_quat(quaternions, scalar_first=True)
 
 
-def _refuse_outside(reports: Reports, clock: FrameClock) -> None:
+def _refuse_outside(reports: Reports, tool: ReportedTool, clock: FrameClock) -> None:
     outside = [number for number, time in enumerate(clock.times) if not reports.covers(time)]
     if not outside:
         return
     if outside[0] == 0 or len(outside) > MAX_OUTSIDE * len(clock.times):
-        raise RecordingError(_apart(reports.times.tolist(), clock))
+        raise RecordingError(_apart(reports.times.tolist(), tool, clock))
 
 
-def _apart(times: list[int], clock: FrameClock) -> str:
+def _apart(times: list[int], tool: ReportedTool, clock: FrameClock) -> str:
     first, last = times[0] / NS_PER_S, times[-1] / NS_PER_S
+    cure = (0.0 if tool.clock_offset is None else tool.clock_offset) - first
     return (
         f"the tool's reports span {first:.10g} to {last:.10g} s from the first frame, the frames 0 to "
         f"{clock.times[-1] / NS_PER_S:.6g} s: they do not overlap as they must. Give tool_clock_offset, what is added "
-        f"to a report's time to get the frames' [s] ({-first:.10g}, or \"{START_TOGETHER}\", if the first report "
+        f"to a report's time to get the frames' [s] ({cure:.10g}, or \"{START_TOGETHER}\", if the first report "
         "belongs to the first frame), or tool_time_unit."
     )
