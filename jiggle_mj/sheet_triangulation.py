@@ -108,6 +108,9 @@ def extend(flat: Float[np.ndarray, "m 2"], *, begin: float, end: float, spacing:
         begin: coordinate along the axis at which the sheet begins [m].
         end: coordinate at which it ends [m].
         spacing: spacing of the lattice [m].
+
+    Raises:
+        MeshError: either end would need more than `MAX_ADDED` vertices.
     """
     first, last = flat[:, 0].min(), flat[:, 0].max()
     zone = max(END_SHARE * (last - first), END_SPACINGS * spacing)
@@ -121,6 +124,7 @@ def extend(flat: Float[np.ndarray, "m 2"], *, begin: float, end: float, spacing:
         if length <= 0:
             continue
         low, high = flat[in_zone, 1].min(), flat[in_zone, 1].max()
+        _refuse_many(float(length), float(high - low), spacing)
         n_rows = max(1, round(length / (spacing * np.sqrt(3) / 2)))
         n_across = max(1, round((high - low) / spacing))
         for row in range(n_rows + 1):
@@ -148,12 +152,8 @@ def fill_outline(
     """
     low, high = outline.min(axis=0), outline.max(axis=0)
     pitch = np.array([spacing, spacing * np.sqrt(3) / 2])
-    across, rows = (float(length) for length in np.ceil((high - low) / pitch) + 1)
-    if not across * rows <= MAX_ADDED:
-        raise MeshError(
-            f"a sheet of {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m at a spacing of {spacing:.3g} m has about "
-            f"{across * rows:.3g} vertices; at most {MAX_ADDED} are allowed: give a larger spacing."
-        )
+    _refuse_many(float(high[1] - low[1]), float(high[0] - low[0]), spacing)
+    across, rows = np.ceil((high - low) / pitch) + 1
     row, column = np.mgrid[: int(rows), : int(across)]
     lattice = low + np.column_stack([(column + 0.5 * (row % 2)).ravel(), row.ravel()]) * pitch
     border = np.concatenate(
@@ -166,6 +166,16 @@ def fill_outline(
     inside = inside[KDTree(border).query(inside)[0] >= BORDER_CLEARANCE * spacing]
     added = np.concatenate([border, inside])
     return added[KDTree(flat).query(added)[0] >= clearance]
+
+
+def _refuse_many(length: float, width: float, spacing: float) -> None:
+    """Refuse a lattice of more than `MAX_ADDED` vertices, before it is made."""
+    count = (np.ceil(length / (spacing * np.sqrt(3) / 2)) + 1) * (np.ceil(width / spacing) + 1)
+    if not count <= MAX_ADDED:
+        raise MeshError(
+            f"a sheet of {width:.3g} x {length:.3g} m at a spacing of {spacing:.3g} m has about {count:.3g} vertices; "
+            f"at most {MAX_ADDED} are allowed: give a larger spacing."
+        )
 
 
 def _within(points: Float[np.ndarray, "p 2"], outline: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, " p"]:

@@ -32,6 +32,12 @@ def test_extension_on_one_side_leaves_the_other_alone():
     assert len(triangulate(np.concatenate([flat, added]), 5.0)) > len(GRID_FACES)
 
 
+@pytest.mark.parametrize("spacing", [1e-5, 1e-300])
+def test_an_extension_of_too_many_vertices_is_refused_before_it_is_made(spacing):
+    with pytest.raises(MeshError, match="at most 20000 are allowed: give a larger spacing"):
+        extend(grid()[:, :2], begin=-6.0, end=3.0, spacing=spacing)
+
+
 @pytest.mark.parametrize("flat", [np.zeros((2, 2)), np.arange(10.0)[:, None] * [1.0, 2.0], np.zeros((5, 2))])
 def test_points_on_a_line_make_no_sheet(flat):
     with pytest.raises(MeshError, match="make no sheet"):
