@@ -69,7 +69,7 @@ def _decompressed(message: CompressedImage) -> UInt8[np.ndarray, "height width 3
     undecodable = f"cannot be decoded as {(message.format or 'png')[:MAX_SHOWN]} ({len(data)} bytes)"
     if size is None:
         raise RecordingError(f"{undecodable}; png and jpeg are read")
-    _refuse_size(*size)
+    refuse_size(*size)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     except cv2.error as failure:
@@ -83,7 +83,7 @@ def _from_raw(message: RawImage) -> UInt8[np.ndarray, "height width 3"]:
     encoding = message.encoding
     if encoding not in RAW_TYPES:
         raise RecordingError(f"has encoding '{encoding[:MAX_SHOWN]}'; {', '.join(RAW_TYPES)} are read")
-    _refuse_size(message.width, message.height)
+    refuse_size(message.width, message.height)
     value, channels = RAW_TYPES[encoding]
     row = message.width * channels * np.dtype(value).itemsize
     step = message.step or row
@@ -103,16 +103,28 @@ def _to_rgb(
         pixels = (pixels >> 8).astype(np.uint8)
     if encoding == "rgb8":
         return pixels.copy()
-    if encoding.startswith("bayer") and min(pixels.shape) < MIN_BAYER_SIDE:
-        raise RecordingError(
-            f"is {pixels.shape[1]}x{pixels.shape[0]}; a Bayer image has at least {MIN_BAYER_SIDE} rows"
-        )
+    refuse_small_bayer(encoding, pixels.shape[1], pixels.shape[0])
     return cv2.cvtColor(pixels, TO_RGB[encoding])
 
 
-def _refuse_size(width: int, height: int) -> None:
+def refuse_size(width: int, height: int) -> None:
+    """Refuse an image without pixels, or with more than `MAX_PIXELS`.
+
+    Raises:
+        RecordingError: it is of that size.
+    """
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise RecordingError(f"is {width}x{height}; images from 1 to {MAX_PIXELS} pixels are read")
+
+
+def refuse_small_bayer(encoding: str, width: int, height: int) -> None:
+    """Refuse a Bayer image of less than `MIN_BAYER_SIDE` rows or columns; other encodings have no such limit.
+
+    Raises:
+        RecordingError: it is smaller.
+    """
+    if encoding.startswith("bayer") and min(width, height) < MIN_BAYER_SIDE:
+        raise RecordingError(f"is {width}x{height}; a Bayer image has at least {MIN_BAYER_SIDE} rows and columns")
 
 
 def _stated_size(data: bytes) -> tuple[int, int] | None:

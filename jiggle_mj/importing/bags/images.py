@@ -13,27 +13,15 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from jaxtyping import Float, UInt8
 
 from ...errors import RecordingError
-from ...recording.images import decode_image
+from ...recording.images import RAW_TYPES, TO_RGB, decode_image, refuse_size, refuse_small_bayer
 
-COLOURS = {
-    "rgb8": (3, None),
-    "8UC3": (3, cv2.COLOR_BGR2RGB),
-    "bgr8": (3, cv2.COLOR_BGR2RGB),
-    "rgba8": (4, cv2.COLOR_RGBA2RGB),
-    "bgra8": (4, cv2.COLOR_BGRA2RGB),
-    "8UC4": (4, cv2.COLOR_BGRA2RGB),
-    "mono8": (1, cv2.COLOR_GRAY2RGB),
-    "8UC1": (1, cv2.COLOR_GRAY2RGB),
-    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
-    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
-    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
-    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+COLOURS = {name: (channels, TO_RGB.get(name)) for name, (value, channels) in RAW_TYPES.items() if value == "u1"} | {
     "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
     "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
-"""Encodings of 8 bits: bytes of a pixel, and OpenCV's conversion to RGB."""
+"""Encodings of 8 bits: bytes of a pixel, and OpenCV's conversion to RGB, None for none: a recording's, and YUV."""
 DEEP = {"mono16": "mono8", "16UC1": "mono8", "rgb16": "rgb8", "bgr16": "bgr8", "rgba16": "rgba8", "bgra16": "bgra8"} | {
     f"bayer_{pattern}16": f"bayer_{pattern}8" for pattern in ("rggb", "bggr", "gbrg", "grbg")
 }
@@ -42,8 +30,6 @@ DEPTHS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 """Encodings of depth: numpy's type, and metres in one unit (REP-118)."""
 MAX_SHALLOW = 4095
 """Largest value of an image of 12 bits: in 16 bits it would be read as black."""
-MAX_PIXELS = 50_000_000
-"""Largest image [px]: above any camera of a stereo pair; a damaged header asks for more."""
 
 
 def rgb_image(message: Any) -> UInt8[np.ndarray, "height width 3"]:
@@ -58,6 +44,7 @@ def rgb_image(message: Any) -> UInt8[np.ndarray, "height width 3"]:
         packed = CompressedImage(data=np.asarray(message.data, np.uint8).tobytes(), format=message.format[:40])
         image, pattern = decode_image(packed), message.format.partition(";")[0].strip()
         if pattern.startswith("bayer_") and pattern in COLOURS and (image == image[..., :1]).all():
+            refuse_small_bayer(pattern, image.shape[1], image.shape[0])
             return cv2.cvtColor(np.ascontiguousarray(image[..., 0]), COLOURS[pattern][1])
         return image
     encoding = DEEP.get(message.encoding, message.encoding)
@@ -73,6 +60,7 @@ def rgb_image(message: Any) -> UInt8[np.ndarray, "height width 3"]:
         pixels = _pixels(message, np.dtype("u1"), size)
     if conversion is None:
         return np.ascontiguousarray(pixels)
+    refuse_small_bayer(encoding, pixels.shape[1], pixels.shape[0])
     return cv2.cvtColor(pixels[..., 0] if size == 1 else pixels, conversion)
 
 
@@ -94,8 +82,7 @@ def _pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
     """Return the pixels of shape (height, width, channels) in the machine's byte order, without the rows' padding."""
     height, width, row = int(message.height), int(message.width), int(message.width) * channels * dtype.itemsize
     data, step = np.ascontiguousarray(message.data, np.uint8), int(message.step) or row
-    if not 0 < height * width <= MAX_PIXELS:
-        raise RecordingError(f"is {width}x{height} pixels; from 1 to {MAX_PIXELS} are read")
+    refuse_size(width, height)
     if step < row or data.size < step * (height - 1) + row:
         raise RecordingError(
             f"has {data.size} bytes; {width}x{height} {message.encoding[:40]} at {step} a row need more"
