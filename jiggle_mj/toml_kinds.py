@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .errors import MAX_SHOWN, RecordingError
+from .likely_name import did_you_mean
 
 MAX_COUNT = (1 << 31) - 1
 """Largest whole number: signed 32 bits, in which recordings store numbers of points and grasps."""
@@ -64,7 +65,8 @@ class StrictTable:
         unknown = sorted(set(self.values) - self.known)
         if unknown:
             raise RecordingError(
-                f"{self.where} has the unknown key '{unknown[0]}'; known: {', '.join(sorted(self.known))}."
+                f"{self.where} has the unknown key {shown(unknown[0])}{did_you_mean(unknown[0], self.known)} Known: "
+                f"{', '.join(sorted(self.known))}."
             )
 
 

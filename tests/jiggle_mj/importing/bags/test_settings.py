@@ -62,7 +62,7 @@ def test_an_empty_map_says_nothing(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("[topics]\nleftt = '/a'", "unknown key 'leftt'; known: depth"),
+        ("[topics]\nleftt = '/a'", r"unknown key 'leftt'; did you mean 'left'\? Known: depth"),
         ("[topic]\nleft = '/a'", "unknown key 'topic'"),
         ("[time]\nclock = 'gps'", "must be one of header, receive"),
         ("[depth]\nrange = [2, 1]", "the smaller first"),
