@@ -5,17 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import RecordingError
+from ..toml_kinds import MAX_SHOWN
 
 GLOB = re.compile(r"[*?\[]")
 """Characters that make a name a pattern."""
-LONGEST_QUOTE = 200
-"""Characters of the user's input that an error quotes."""
 
 
 def quoted(text: object) -> str:
-    """Return input for an error: on one line, at most `LONGEST_QUOTE` characters."""
+    """Return input for an error: on one line, at most `MAX_SHOWN` characters."""
     shown = str(text).encode("unicode_escape", "backslashreplace").decode("ascii")
-    return shown if len(shown) <= LONGEST_QUOTE else shown[:LONGEST_QUOTE] + "..."
+    return shown if len(shown) <= MAX_SHOWN else shown[:MAX_SHOWN] + "..."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -179,7 +179,7 @@ def _grasp(table: StrictTable) -> GivenGrasp:
     grasp = GivenGrasp(
         held=_held(table),
         radius=table.take("radius", kinds.positive, DEFAULT_GRASP_RADIUS),
-        after=table.take("after", _not_negative, 0.0),
+        after=table.take("after", kinds.not_negative, 0.0),
         run=table.take("run", _integer, None),
         begin=table.take("begin", kinds.number, None),
         end=table.take("end", kinds.number, None),
@@ -254,16 +254,6 @@ def _offset(value: Any) -> float | None:
         return kinds.number(value)
     except TypeError as failure:
         raise TypeError(f'a number [s], or "{START_TOGETHER}"') from failure
-
-
-def _not_negative(value: Any) -> float:
-    try:
-        number = kinds.number(value)
-    except TypeError as failure:
-        raise TypeError("a number from 0") from failure
-    if number < 0:
-        raise TypeError("a number from 0")
-    return number
 
 
 def _integer(value: Any) -> int:

@@ -1,11 +1,11 @@
 """The files of a ROS bag: which there are, whether they are whole, and one line for whatever a library raises."""
 
-import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from ...errors import JiggleError, RecordingError
+from ..points.frame_order import natural_key
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 """Suffixes of the files that a ROS 2 bag consists of."""
@@ -40,7 +40,7 @@ def _storage_files(folder: Path) -> list[Path]:
 
 def _in_order(files: Iterable[Path]) -> list[Path]:
     """Return files by name, with the numbers in their names in the order of counting."""
-    return sorted(files, key=lambda file: [(part.isdigit(), part.zfill(20)) for part in re.split(r"(\d+)", file.name)])
+    return sorted(files, key=lambda file: (natural_key(file.name), file.name))
 
 
 def bag_files(path: Path) -> list[Path]:

@@ -3,11 +3,8 @@
 Nothing is unpickled: a pickle can run code.
 """
 
-import struct
-import tokenize
 import warnings
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -19,29 +16,18 @@ from jaxtyping import Shaped
 from numpy.lib import format as npy_format
 
 from ...errors import RecordingError
+from ...recording.npz_arrays import MALFORMED
 from ..data_folder import quoted
 from .file_kinds import MAX_POSITION_BYTES, file_kind
 from .mat_files import mat_arrays
 
 DAMAGE = (
-    OSError,
-    ValueError,
-    TypeError,
+    *MALFORMED,
     LookupError,
     NameError,
-    EOFError,
     ArithmeticError,
-    MemoryError,
-    RuntimeError,
-    NotImplementedError,
-    SyntaxError,
-    AttributeError,
     AssertionError,
-    struct.error,
-    tokenize.TokenError,
-    zlib.error,
     LZMAError,
-    zipfile.BadZipFile,
     Warning,
 )
 """What the readers of numpy, trimesh and the standard library raise on damaged bytes."""

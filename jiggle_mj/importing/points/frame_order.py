@@ -26,7 +26,7 @@ def frame_files(folder: DataFolder, patterns: Sequence[str]) -> tuple[list[Path]
     notes: list[str] = []
     for pattern in patterns:
         found = sorted(folder.matching(pattern))
-        ordered = sorted(found, key=lambda path: (_natural(_stem(path)), path.name))
+        ordered = sorted(found, key=lambda path: (natural_key(_stem(path)), path.name))
         _refuse_unequal_fractions(ordered, pattern)
         if ordered != found:
             before, after = next((a, b) for a, b in pairwise(ordered) if found.index(a) > found.index(b))
@@ -51,7 +51,7 @@ def _shown(before: Path, after: Path) -> str:
 def _are_out_of_order(before: Path, after: Path) -> bool:
     """Return whether two files that differ by numbers alone are in another order than their numbers."""
     same = DIGITS.sub("", str(before)) == DIGITS.sub("", str(after))
-    return same and _natural(_stem(before)) > _natural(_stem(after))
+    return same and natural_key(_stem(before)) > natural_key(_stem(after))
 
 
 def _stem(path: Path) -> str:
@@ -59,7 +59,7 @@ def _stem(path: Path) -> str:
     return str(path.with_suffix("")) if path.suffix else str(path)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def natural_key(name: str) -> list[tuple[int, str]]:
     """Return a key that compares numbers by value; text and numbers alternate, so that like compares with like."""
     return [(int(part), "") if part.isdecimal() else (0, part) for part in DIGITS.split(name)]
 
