@@ -61,18 +61,17 @@ def check_before(recording: Recording, path: Path, declare: Mapping[str, Any], *
 def show_survey(path: Path) -> Survey:
     """Print the survey of a recording that was just imported as a table, then what is doubtful about it.
 
-    An implausible recording is removed, with its truth.
+    A recording that is refused is removed, with its truth.
 
     Raises:
         RecordingError: the recording cannot be read, or is implausible.
     """
-    recording = Recording.open(path)
-    surveyed = survey(recording)
-    table = Table("surveyed", "", box=None)
-    for name, value in rows(surveyed):
-        table.add_row(name, value)
-    console.print(table)
     try:
+        surveyed = survey(Recording.open(path))
+        table = Table("surveyed", "", box=None)
+        for name, value in rows(surveyed):
+            table.add_row(name, value)
+        console.print(table)
         report(surveyed, path)
     except RecordingError:
         for written in (path, truth_path(path)):
