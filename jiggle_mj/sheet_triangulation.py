@@ -170,7 +170,8 @@ def fill_outline(
 
 def _refuse_many(length: float, width: float, spacing: float) -> None:
     """Refuse a lattice of more than `MAX_ADDED` vertices, before it is made."""
-    count = (np.ceil(length / (spacing * np.sqrt(3) / 2)) + 1) * (np.ceil(width / spacing) + 1)
+    rows, across = (float(np.ceil(each)) + 1 for each in (length / (spacing * 3**0.5 / 2), width / spacing))
+    count = rows * across
     if not count <= MAX_ADDED:
         raise MeshError(
             f"a sheet of {width:.3g} x {length:.3g} m at a spacing of {spacing:.3g} m has about {count:.3g} vertices; "
