@@ -1,4 +1,8 @@
-"""Output that appears complete or not at all: written in a hidden folder beside its place, and renamed at the end."""
+"""Imports that appear complete or not at all: written in a hidden folder beside their place, and renamed at the end.
+
+A writer of recordings completes its file even where an error ends it, so that a crashed run can be read. Half an import
+is of no use.
+"""
 
 import os
 import shutil
@@ -8,35 +12,39 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import OutputError
+from ..recording.mcap_files import truth_path
+from ..recording.output_files import PartialFile
 
 
 @contextmanager
-def complete_files(recording: Path, truth: Path, *, overwrite: bool) -> Iterator[tuple[Path, Path]]:
+def complete_files(recording: Path, *, overwrite: bool) -> Iterator[tuple[Path, Path]]:
     """Return paths to write a recording and its truth to; both get their names when the block ends without an error.
 
-    A truth that is not written leaves none: an older one beside the recording is removed.
+    Until then no other process can write that recording. A truth that is not written leaves none: an older one beside
+    the recording is removed.
 
     Raises:
-        OutputError: a file exists and `overwrite` is false, or the folder cannot be written.
+        OutputError: a file exists and `overwrite` is false, another process writes it, or it cannot be written.
     """
-    if recording.is_dir():
-        raise OutputError(f"{recording} is a folder; give a file, such as {recording / 'run.mcap'}.")
-    for path in (recording, truth):
-        if path.exists() and not overwrite:
-            raise OutputError(f"{path} exists; choose another path, or allow the file to be replaced (--overwrite).")
+    truth = truth_path(recording)
+    if recording.exists() and not (recording.is_file() or recording.is_dir()):
+        raise OutputError(f"{recording} is a device or a pipe; give a file, such as run.mcap.")
+    claim = PartialFile(recording, overwrite=overwrite)
+    folder: Path | None = None
     try:
+        if truth.exists() and not overwrite:
+            raise OutputError(f"{truth} exists; choose another path, or allow the file to be replaced (--overwrite).")
         folder = Path(tempfile.mkdtemp(prefix=f".{recording.name[:50]}-", dir=recording.parent))
-    except (OSError, ValueError) as failure:
-        raise OutputError(f"{recording} cannot be written: {getattr(failure, 'strerror', failure)}.") from failure
-    part, truth_part = folder / "run.mcap", folder / "run.truth.mcap"
-    try:
+        part, truth_part = folder / "run.mcap", folder / "run.truth.mcap"
         yield part, truth_part
         if truth_part.exists():
             os.replace(truth_part, truth)
         else:
             truth.unlink(missing_ok=True)
-        os.replace(part, recording)
+        os.replace(part, claim.path)
     except OSError as failure:
         raise OutputError(f"{recording} cannot be written: {failure.strerror}.") from failure
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        claim.discard()
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)

@@ -103,7 +103,7 @@ def import_folder(
     truth = measured_truth(data, given, rest, mesh, name)
     skipped: list[tuple[str, str]] = []
     n_frames, n_unseen, previous_time = 0, 0, 0
-    with complete_files(out, truth_path(out), overwrite=overwrite) as (part, truth_part):
+    with complete_files(out, overwrite=overwrite) as (part, truth_part):
         with RecordingWriter(
             part,
             camera=None,

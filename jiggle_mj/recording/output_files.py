@@ -80,6 +80,12 @@ class PartialFile:
             os.replace(self.partial, self.path)
         self.file.close()
 
+    def discard(self) -> None:
+        """Remove the partial file and let others write; a complete file stays as it is."""
+        with suppress(OSError):
+            self.partial.unlink()
+        self.file.close()
+
     def _is_mine(self) -> bool:
         """Return whether the locked file still has the partial name, which its last writer may have changed."""
         try:

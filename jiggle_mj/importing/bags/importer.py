@@ -1,14 +1,12 @@
 """Import of a ROS bag: a robot's own recording becomes one of ours.
 
 Two passes: `survey` reads all that is small and the stamps of the rest, then images and clouds come frame by frame, so
-the memory does not grow with the bag. The output is written beside its name and gets the name when it is complete; its
-bytes depend on the content of the bag alone.
+the memory does not grow with the bag. The bytes of the output depend on the content of the bag alone.
 """
 
 import os
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from ...errors import OutputError, RecordingError
 from ...observation import MeasuredPoints, Observation, StereoPair, ToolState
 from ...recording.declaration import identity
 from ...recording.writer import RecordingWriter
+from ..complete_files import complete_files
 from ..grasp_table import DEFAULT_GRASP_RADIUS
 from .bag_file import Bag
 from .bag_paths import refusing
@@ -81,16 +80,18 @@ def import_bag(
         OutputError: the output exists, or cannot be written.
     """
     bag, out, settings = Path(bag), Path(out), settings or BagSettings()
-    if out.exists() and not overwrite:
-        raise OutputError(f"{out} exists; choose another path, or allow the file to be replaced (--overwrite).")
     if out.resolve() == bag.resolve() or bag.resolve() in out.resolve().parents:
         raise OutputError(f"{out} is the bag, or lies in it; choose another path.")
-    with Bag(bag, allow_truncated=settings.allow_truncated) as source:
+    with (
+        complete_files(out, overwrite=overwrite) as (part, _),
+        Bag(bag, allow_truncated=settings.allow_truncated) as source,
+    ):
         with refusing(bag, "a message"):
-            return _import(source, out, settings)
+            return _import(source, part, out, settings)
 
 
-def _import(bag: Bag, out: Path, settings: BagSettings) -> BagSummary:
+def _import(bag: Bag, part: Path, out: Path, settings: BagSettings) -> BagSummary:
+    """Write the recording to `part`, which becomes `out`; return its summary."""
     refuse_foreign(bag)
     roles, unsure = choose_roles(bag.topics, settings.topics)
     prepared = prepare(bag, roles, unsure, settings)
@@ -98,29 +99,20 @@ def _import(bag: Bag, out: Path, settings: BagSettings) -> BagSummary:
     camera = _checked_camera(bag, prepared, notes)
     if camera is not None:
         notes += tool_in_view(camera, prepared)
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     skipped: Counter[str] = Counter()
     written: list[int] = []
-    try:
-        with RecordingWriter(
-            partial,
-            camera=camera,
-            declaration=prepared.declaration,
-            metadata={"source": "ROS bag", "identity": _identity(prepared)},
-            overwrite=True,
-        ) as writer:
-            _write_frames(bag, prepared, writer, skipped, written)
-        if not written:
-            reason, count = skipped.most_common(1)[0]
-            raise RecordingError(
-                f"{bag.path}: none of {sum(skipped.values())} frames can be used; {count} times: {reason}."
-            )
-        os.replace(partial, out)
-    except OSError as failure:
-        raise OutputError(f"{out} cannot be written: {failure.strerror}.") from failure
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
+    with RecordingWriter(
+        part,
+        camera=camera,
+        declaration=prepared.declaration,
+        metadata={"source": "ROS bag", "identity": _identity(prepared)},
+    ) as writer:
+        _write_frames(bag, prepared, writer, skipped, written)
+    if not written:
+        reason, count = skipped.most_common(1)[0]
+        raise RecordingError(
+            f"{bag.path}: none of {sum(skipped.values())} frames can be used; {count} times: {reason}."
+        )
     if prepared.settings.grasp_radius is None and all(state.radius is None for state in prepared.jaws):
         notes.append(f"radius of the grip: {1e3 * DEFAULT_GRASP_RADIUS:g} mm is assumed; say yours with --grasp-radius")
     used = [state for state in prepared.jaws if state.closed]

@@ -11,6 +11,7 @@ from jiggle_mj.importing.bags.gripper import ClosedRule
 from jiggle_mj.importing.bags.importer import BagSummary, import_bag
 from jiggle_mj.importing.bags.settings import BagSettings, DepthSettings
 from jiggle_mj.observation import Declaration
+from jiggle_mj.recording.output_files import PartialFile
 from tests.support.robot_bags import (
     STEP,
     RobotBag,
@@ -351,3 +352,16 @@ def test_a_type_that_a_bag_defines_anew_is_one_line(tmp_path: Path):
             made.write("/gripper/closed", index * STEP, "std_msgs/Bool", data=["yes"])
 
     assert "cannot be read" in refused(bag(tmp_path, cameras, write_images, odd))
+
+
+def test_an_import_keeps_no_older_truth_and_waits_for_no_other_writer(tmp_path):
+    path, out = small_bag(tmp_path / "bag"), tmp_path / "run.mcap"
+    (tmp_path / "run.truth.mcap").write_text("of another recording")
+    with pytest.raises(OutputError, match=r"run\.truth\.mcap exists"):
+        import_bag(path, out)
+    writer = PartialFile(out, overwrite=True)
+    with pytest.raises(OutputError, match="is being written by another process"):
+        import_bag(path, out, overwrite=True)
+    writer.discard()
+    import_bag(path, out, overwrite=True)
+    assert {each.name for each in tmp_path.iterdir()} == {"bag", "run.mcap"}
