@@ -20,6 +20,7 @@ from mcap.records import Channel, Message, Schema
 from ...errors import RecordingError
 from ...recording.mcap_files import iterate_records
 from .bag_paths import bag_files, refuse_cut_database, refusing
+from .ros1_chunks import bound_chunks
 
 ROS_ENCODINGS = ("cdr", "ros1")
 """Encodings of the messages of ROS 2 and ROS 1."""
@@ -133,10 +134,11 @@ class Bag:
             return _McapFile(file, allow_truncated=self._allow_truncated)
         from rosbags import rosbag1, rosbag2
 
-        return _RosbagsFile(
-            self._stack.enter_context((rosbag1 if file.suffix == ".bag" else rosbag2).Reader(file)),
-            "ros1" if file.suffix == ".bag" else "cdr",
-        )
+        if file.suffix != ".bag":
+            return _RosbagsFile(self._stack.enter_context(rosbag2.Reader(file)), "cdr")
+        reader = self._stack.enter_context(rosbag1.Reader(file))
+        bound_chunks(reader)
+        return _RosbagsFile(reader, "ros1")
 
 
 class _RosbagsFile:

@@ -5,11 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as Writer1
 
 from jiggle_mj import Recording
 from jiggle_mj.errors import OutputError, RecordingError
+from jiggle_mj.importing.bags import ros1_chunks
 from jiggle_mj.importing.bags.bag_file import Bag
 from jiggle_mj.importing.bags.bag_paths import is_bag
+from jiggle_mj.importing.bags.gripper import ClosedRule
 from jiggle_mj.importing.bags.importer import import_bag
 from jiggle_mj.importing.bags.settings import BagSettings
 from tests.support.robot_bags import (
@@ -40,6 +43,22 @@ def test_a_bag_of_each_kind_becomes_the_recording_that_was_seen(tmp_path: Path, 
         np.testing.assert_array_equal(each.images.left, small_image(2 * index))
         np.testing.assert_array_equal(each.images.right, small_image(2 * index + 1))
         np.testing.assert_array_equal(each.tool.position, [1e-3 * index, 0.02, 0.0])
+
+
+@pytest.mark.parametrize("compression", [Writer1.CompressionFormat.LZ4, Writer1.CompressionFormat.BZ2])
+def test_the_chunks_of_a_compressed_ros_1_bag_are_bounded(tmp_path: Path, monkeypatch, compression):
+    """A small file must not fill the memory; the limit is lowered, as a bag beyond it would take seconds to write."""
+    made = RobotBag(tmp_path / "bag", "ros1")
+    made.writer.set_compression(compression)
+    with made:
+        made.cameras(small_camera())
+        write_images(made)
+        write_tool(made)
+    import_bag(made.path, tmp_path / "run.mcap", BagSettings(closed=ClosedRule.parse("always")))
+    assert len(list(Recording.open(tmp_path / "run.mcap"))) == 4
+    monkeypatch.setattr(ros1_chunks, "MAX_CHUNK_BYTES", 10_000)
+    with pytest.raises(RecordingError, match="more than 10000 bytes once decompressed"):
+        import_bag(made.path, tmp_path / "other.mcap", BagSettings(closed=ClosedRule.parse("always")))
 
 
 def test_the_bytes_depend_on_the_content_alone(tmp_path: Path):
