@@ -25,8 +25,8 @@ from .grasp_table import GraspTable, Rows, read_choice, read_grasps
 from .points.points_table import PointFiles, read_points_table
 from .units import LENGTH_UNITS, TIME_UNITS, unit_of
 
-MAX_ROTATION_ERROR = 1e-6
-"""Largest entry of R R^T - 1 of a rotation: the rounding of six decimals."""
+MAX_ROTATION_ERROR = 2e-5
+"""Largest entry of R R^T - 1 of a rotation: the rounding of five decimals."""
 MAX_OUTLINE_POINTS = 1000
 """Corners that an outline may have."""
 
@@ -234,7 +234,10 @@ def _details(truth: StrictTable) -> dict[str, object]:
 
 def _frame(table: StrictTable) -> WorldFrame:
     rotation = np.array(table.take("rotation", kinds.matrix, np.eye(3).tolist()))
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_ROTATION_ERROR) or np.linalg.det(rotation) < 0:
+    if (
+        not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=MAX_ROTATION_ERROR)
+        or np.linalg.det(rotation) < 0
+    ):
         raise RecordingError(f"{table.where} rotation is not a rotation: {rotation.tolist()}.")
     translation = np.array(table.take("translation", kinds.vector, [0.0, 0.0, 0.0]))
     table.refuse_unknown()

@@ -29,14 +29,12 @@ from .point_files import read_frames
 from .points.archives import read_array
 from .points.measured import PointFrames
 from .tool import Tool
-from .units import LENGTH_UNITS, likely_unit
+from .units import LENGTH_UNITS, LIKELY_EXTENT, likely_unit
 
 MIN_EXTENT, MAX_EXTENT = 2e-3, 2.0
 """Smallest and largest extent of a sheet [m]: outside it the unit is wrong, or this is no tissue or cloth."""
 MAX_NOISE_SHARE = 0.25
 """Largest noise, as a share of the sheet's extent: with more, points do not show the sheet's shape."""
-LIKELY_EXTENT = (0.01, 0.5)
-"""Extents of which a unit is offered as a cure [m]: usual pieces of tissue and cloth."""
 MIN_REST_POINTS = 3
 """Finite points that a rest frame needs: three span a plane."""
 

@@ -13,7 +13,7 @@ from .point_files import read_frames
 from .points.archives import array_shapes
 from .points.dic_formats import DIC_FORMATS
 from .points.points_table import PointFiles
-from .units import LENGTH_UNITS, PREFERRED_UNITS
+from .units import LENGTH_UNITS, LIKELY_EXTENT, PREFERRED_UNITS
 
 ARCHIVES, FRAMES = (".npz", ".mat"), (".csv", ".txt", ".tsv", ".xyz", ".dat", ".ply", ".obj", ".pcd", ".asc", ".pts")
 """Endings of files that hold all frames, and of files that hold one each."""
@@ -23,8 +23,6 @@ VISIBILITY = re.compile(r"visib|valid|occlu", re.IGNORECASE)
 """Names of arrays that say which points are seen."""
 UNIT_SUFFIX = re.compile(r"_(um|mm|cm|m)$")
 """End of an array's name that states its unit of length."""
-LIKELY_EXTENT = (0.01, 0.5)
-"""Extent of a sheet of tissue or cloth, by which the unit is guessed [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,8 @@ LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 """Metres in one unit of length."""
 PREFERRED_UNITS = ("m", "mm", "cm", "um")
 """Units of length in the order in which they are tried: cm are rare in exports, and um fit any place near 0."""
+LIKELY_EXTENT = (0.01, 0.5)
+"""Extents of usual pieces of tissue and cloth, by which a unit is guessed, or offered as a cure [m]."""
 TIME_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Nanoseconds in one unit of time."""
 

@@ -14,13 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ...camera import MAX_BASELINE_M, CameraCalibration, StereoCamera
-from ...errors import RecordingError
+from ...errors import ObservationError, RecordingError
 from ...recording.frames import transform_of_rotation
 
 MODELS = ("plumb_bob", "rational_polynomial")
 """Distortion models that are read; with coefficients of zero every model is none."""
-MAX_ROTATION_ERROR = 1e-3
-"""Largest entry of R R^T - 1 of a rotation: a calibration file's rounding to four digits."""
 BASELINE_AGREEMENT = 0.05
 """Largest relative difference of the baselines of CameraInfo and /tf that passes without a word."""
 
@@ -172,8 +170,6 @@ def _source(
         raise RecordingError(f"{where}: K, R, P have {K.size}, {R.size}, {P.size} numbers; they must have 9, 9, 12.")
     if not all(np.isfinite(each).all() for each in (K, D, R, P)):
         raise RecordingError(f"{where} holds numbers that are not finite.")
-    if not np.allclose(R.reshape(3, 3) @ R.reshape(3, 3).T, np.eye(3), atol=MAX_ROTATION_ERROR):
-        raise RecordingError(f"{where}: R is no rotation: {R.round(6).tolist()}.")
     if not (K[0] > 0 and K[4] > 0 and width > 0 and height > 0):
         raise RecordingError(
             f"{where} is not calibrated: fx = {K[0]:g}, size {width}x{height}; calibrate the camera, and give the file "
@@ -186,19 +182,18 @@ def _source(
         )
     if D.size > 8 and D[8:].any():
         raise RecordingError(f"{where} has {D.size} distortion coefficients that are not zero; up to 8 are read.")
-    return CameraSource(
-        calibration=CameraCalibration(
+    try:
+        calibration = CameraCalibration(
             width=width,
             height=height,
             K=K.reshape(3, 3),
             P=P.reshape(3, 4) if has_P else np.hstack([K.reshape(3, 3), np.zeros((3, 1))]),
             D=_padded(D),
             R=R.reshape(3, 3),
-        ),
-        has_P=has_P,
-        frame=frame,
-        where=where,
-    )
+        )
+    except ObservationError as failure:
+        raise RecordingError(f"{where}: {failure}") from failure
+    return CameraSource(calibration=calibration, has_P=has_P, frame=frame, where=where)
 
 
 def _padded(D: Float[np.ndarray, " d"]) -> Float[np.ndarray, " e"]:

@@ -18,6 +18,7 @@ from ...camera import StereoCamera
 from ...errors import OutputError, RecordingError
 from ...observation import MeasuredPoints, Observation, StereoPair, ToolState
 from ...recording.declaration import identity
+from ...recording.reader import PAIRING_TOLERANCE_NS
 from ...recording.writer import RecordingWriter
 from ..complete_files import complete_files
 from ..grasp_table import DEFAULT_GRASP_RADIUS
@@ -33,9 +34,6 @@ from .roles import choose_roles
 from .settings import BagSettings, Role
 from .tool_in_view import tool_in_view
 from .transforms import frame_name
-
-JAW_DELAY = 5_000_000
-"""Time after a frame until which a message of the gripper counts for it [ns], as in `Recording`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +153,7 @@ def _write_frames(
 def _observation(prepared: Preparation, stamp: int, read: dict[Role, Any]) -> Observation:
     """Return the observation of one frame; its index, its time from the start and its reports are the caller's."""
     position, quat_wxyz = prepared.tool.at(stamp)
-    jaws = state_at(prepared.jaws, stamp + JAW_DELAY)
+    jaws = state_at(prepared.jaws, stamp + PAIRING_TOLERANCE_NS)  # as `Recording` reads them
     images = points = None
     if "left" in read:
         images = StereoPair(left=_image(prepared, "left", read), right=_image(prepared, "right", read))

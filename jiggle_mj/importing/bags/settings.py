@@ -11,7 +11,9 @@ from typing import Any, Literal, cast, get_args
 
 from ... import toml_kinds as kinds
 from ...errors import OptionError, RecordingError
+from ...likely_name import did_you_mean
 from ...observation import Declaration
+from ...recording.reader import PAIRING_TOLERANCE_NS
 from ...toml_kinds import StrictTable
 from ..declaration import parse_declaration_table
 from .gripper import ClosedRule
@@ -24,8 +26,10 @@ Side = Literal["left", "right"]
 """Which camera of the pair."""
 Clock = Literal["header", "receive"]
 """Whose time a message has: its own header's, or that of the recorder that received it."""
-PAIRING_TOLERANCE_MS = 5.0
+PAIRING_TOLERANCE_MS = PAIRING_TOLERANCE_NS / 1e6
 """Default largest difference between the stamps of a left and a right image [ms]."""
+MIN_SPACING = 1e-5
+"""Smallest edge of the cubes into which depth is gathered [m]: far below what a depth camera resolves."""
 MS = 1_000_000
 """Nanoseconds in a millisecond."""
 
@@ -112,7 +116,7 @@ def read_map(path: Path) -> BagSettings:
             near=limits[0],
             far=limits[1],
             mask=None if mask is None else path.parent / mask,
-            spacing=depth.take("spacing", kinds.positive, DepthSettings.spacing),
+            spacing=depth.take("spacing", _spacing, DepthSettings.spacing),
         ),
         declaration=parse_declaration_table(tables["declaration"]) if tables["declaration"].given else None,
     )
@@ -174,7 +178,10 @@ def with_options(
 def _pair(text: str, option: str, allowed: Sequence[str]) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not equals or name not in allowed:
-        raise OptionError(f"{option} must be NAME=VALUE with NAME one of {', '.join(allowed)}; got '{text[:200]}'.")
+        meant = did_you_mean(name, allowed)
+        raise OptionError(
+            f"{option} must be NAME=VALUE with NAME one of {', '.join(allowed)}; got '{text[:200]}'{meant}"
+        )
     return name, value
 
 
@@ -182,6 +189,12 @@ def _range(value: Any) -> list[float]:
     if not isinstance(value, list) or len(value) != 2 or not 0 <= kinds.number(value[0]) < kinds.number(value[1]):
         raise TypeError("two numbers from 0, the smaller first")
     return [float(each) for each in value]
+
+
+def _spacing(value: Any) -> float:
+    if kinds.number(value) < MIN_SPACING:
+        raise TypeError(f"a number from {MIN_SPACING:g} [m]")
+    return float(value)
 
 
 def _clock(table: StrictTable) -> Clock:

@@ -14,13 +14,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from ...camera import matrix_from_quaternion
 from ...errors import RecordingError
 from ...observation import ToolReport
+from ...recording.reader import PAIRING_TOLERANCE_NS
 from .stamps import TopicTimes
 from .transforms import TransformTree, frame_name, parse_ros_pose
 
 MAX_REPORT_AGE = 100_000_000
 """Longest time from a report to a frame that it speaks for [ns]; twice that between two reports around it."""
-MIN_DISTANCE = 5_000_000
-"""Time after a frame in which a report is dropped [ns]: a reader would take it for the frame's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +117,8 @@ class ToolTrack:
 
     def between(self, begin: int, end: int, origin: int) -> tuple[ToolReport, ...]:
         """Return the reports between two frames [ns], with times from an origin [ns]."""
-        inside = (self.times > begin + MIN_DISTANCE) & (self.times < end)
+        # `Recording` would take a report just after a frame for the frame's own.
+        inside = (self.times > begin + PAIRING_TOLERANCE_NS) & (self.times < end)
         return tuple(
             ToolReport(time=int(time) - origin, position=position)
             for time, position in zip(self.times[inside], self.positions[inside], strict=True)

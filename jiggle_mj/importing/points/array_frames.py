@@ -12,13 +12,12 @@ from .archives import array_shapes, describe, read_array
 from .file_kinds import refuse_many
 from .layouts import FRAMES_FIRST, frames_first
 from .measured import Measured
+from .missing_rule import AXES
 from .points_table import NONE, PointFiles
 from .unseen import VISIBILITY_NAME, read_visibility, split_negation
 
 HIDDEN_NAME = re.compile(r"occlu|lost|invis|invalid", re.IGNORECASE)
 """Names of arrays that are true where a point is not seen."""
-AXES = ("x", "y", "z")
-"""Names of the coordinates in a rule."""
 
 
 def read_array_frames(paths: list[Path], points: PointFiles) -> Measured:

@@ -11,11 +11,10 @@ from ..data_folder import quoted
 from .file_kinds import refuse_many
 from .measured import Measured
 from .mesh_files import read_obj, read_ply
+from .missing_rule import AXES
 from .pcd import read_pcd
 from .points_table import PointFiles
 
-AXES = ("x", "y", "z")
-"""Names of the coordinates in a rule."""
 OBJ_COLUMNS = (1, 2, 3)
 """Columns of x, y and z in the line of a vertex of an OBJ; naming them changes nothing."""
 

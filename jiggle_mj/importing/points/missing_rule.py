@@ -24,7 +24,8 @@ OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
 """Comparisons of a rule, the longer signs first."""
 RULE = re.compile(r"\s*(?P<column>.*?)\s*(?P<sign>==|!=|<=|>=|<|>)\s*(?P<value>[^=<>]+?)\s*")
 """A rule is written `COLUMN OPERATOR NUMBER`."""
-
+AXES = ("x", "y", "z")
+"""Names of the coordinates in a rule, and in headings where the user names no columns."""
 FLOAT32_ROUNDING = 1e-6
 """Relative difference between a number and what a file of 32-bit floats holds of it."""
 

@@ -10,15 +10,13 @@ from ..data_folder import quoted
 from .dic_formats import DIC_FORMATS, DISPLACEMENT_HEADINGS
 from .file_kinds import refuse_many
 from .measured import Measured
-from .missing_rule import MissingRule
+from .missing_rule import AXES, MissingRule
 from .points_table import PointFiles
 from .text_format import TextFormat, plain_heading
 from .text_lines import read_lines
 from .text_table import TextTable
 
 Column = int | str
-AXES = ("x", "y", "z")
-"""Headings of positions, where the user names no columns."""
 
 
 def read_text_frames(paths: list[Path], points: PointFiles) -> Measured:
