@@ -29,7 +29,7 @@ Clock = Literal["header", "receive"]
 PAIRING_TOLERANCE_MS = PAIRING_TOLERANCE_NS / 1e6
 """Default largest difference between the stamps of a left and a right image [ms]."""
 MIN_SPACING = 1e-5
-"""Smallest edge of the cubes of which each gives one point of a depth image [m]: far below what a depth camera resolves."""
+"""Smallest edge of the cubes that thin a depth image [m]: far below what a depth camera resolves."""
 MS = 1_000_000
 """Nanoseconds in a millisecond."""
 
