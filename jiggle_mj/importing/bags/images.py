@@ -43,9 +43,9 @@ def rgb_image(message: Any) -> UInt8[np.ndarray, "height width 3"]:
             raise RecordingError("is a compressed depth image; record the depth as sensor_msgs/Image")
         packed = CompressedImage(data=np.asarray(message.data, np.uint8).tobytes(), format=message.format[:40])
         image, pattern = decode_image(packed), message.format.partition(";")[0].strip()
-        if pattern.startswith("bayer_") and pattern in COLOURS and (image == image[..., :1]).all():
+        if pattern.startswith("bayer_") and pattern in TO_RGB and (image == image[..., :1]).all():
             refuse_small_bayer(pattern, image.shape[1], image.shape[0])
-            return cv2.cvtColor(np.ascontiguousarray(image[..., 0]), COLOURS[pattern][1])
+            return cv2.cvtColor(np.ascontiguousarray(image[..., 0]), TO_RGB[pattern])
         return image
     encoding = DEEP.get(message.encoding, message.encoding)
     if encoding not in COLOURS:
