@@ -9,8 +9,8 @@ from ..mesh_checks import check_mesh
 from ..observation import DeclaredMesh
 from ..sheet_triangulation import CLEARANCE, SheetPlane, extend, fill_outline, triangulate
 from .data_folder import DataFolder
-from .declaration import Extension, Margin, MeasuredRecording
 from .faces import read_faces
+from .recording_toml import Extension, Margin, MeasuredRecording
 
 MAX_EDGE_SPACINGS = 2.5
 """Longest edge of a triangle that is not declared [spacings]: it bridges one missing row of points, but not two."""

@@ -11,12 +11,12 @@ from scipy.spatial import KDTree
 
 from ..errors import RecordingError
 from .data_folder import DataFolder
-from .declaration import MeasuredRecording
 from .points.archives import read_array
 from .points.file_kinds import file_kind
 from .points.mesh_files import MeshFile, read_obj, read_ply
 from .points.text_lines import read_lines
 from .points.text_table import TextTable
+from .recording_toml import MeasuredRecording
 
 MAX_MATCH_SPACINGS = 0.5
 """Distance of a vertex from its point, in spacings of the vertices: beyond it another vertex may be nearer."""

@@ -22,12 +22,12 @@ from ..recording.writer import RecordingWriter
 from .clock import FrameClock, frame_clock
 from .complete_files import complete_files
 from .data_folder import DataFolder
-from .declaration import MeasuredRecording, read_recording_toml
 from .declared_mesh import declared_mesh
 from .known_attachments import measured_truth
 from .point_files import read_frames
 from .points.archives import read_array
 from .points.measured import PointFrames
+from .recording_toml import MeasuredRecording, read_recording_toml
 from .tool import Tool
 from .units import LENGTH_UNITS, LIKELY_EXTENT, likely_unit
 

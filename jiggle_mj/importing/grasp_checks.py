@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from ..errors import RecordingError
 from .clock import FrameClock
-from .declaration import MeasuredRecording
 from .grasps import GraspSpan
+from .recording_toml import MeasuredRecording
 from .reports import Reports
 from .units import LENGTH_UNITS, PREFERRED_UNITS
 

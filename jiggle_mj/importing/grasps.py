@@ -10,9 +10,9 @@ from ..errors import RecordingError
 from ..recording.schemas import NS_PER_S
 from .clock import FrameClock
 from .data_folder import DataFolder
-from .declaration import MeasuredRecording
 from .grasp_table import GivenGrasp, NearPlace
 from .point_files import read_rows
+from .recording_toml import MeasuredRecording
 from .reports import Reports
 
 

@@ -8,9 +8,9 @@ from ..observation import DeclaredMesh
 from ..sheet_triangulation import SheetPlane, triangulate
 from ..truth import Truth
 from .data_folder import DataFolder
-from .declaration import MeasuredRecording, Region, Rows
 from .declared_mesh import MAX_EDGE_SPACINGS, spacing_of
 from .point_files import read_rows
+from .recording_toml import MeasuredRecording, Region, Rows
 
 
 def measured_truth(

@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 
 from ..errors import RecordingError
 from .data_folder import DataFolder, quoted
-from .declaration import Rows
 from .points.array_frames import read_array_frames
 from .points.file_kinds import FileKind, file_kind
 from .points.frame_order import frame_files
@@ -20,6 +19,7 @@ from .points.points_table import PointFiles
 from .points.text_frames import missing_rule, read_text_frames
 from .points.text_lines import read_text
 from .points.unseen import MarkCheck
+from .recording_toml import Rows
 
 
 def read_frames(folder: DataFolder, points: PointFiles) -> PointFrames:

@@ -11,10 +11,10 @@ from ..observation import IDENTITY_WXYZ, ToolReport
 from ..recording.schemas import NS_PER_S
 from .clock import FrameClock, absolute_times
 from .data_folder import DataFolder
-from .declaration import MeasuredRecording
 from .grasp_table import START_TOGETHER, ReportedTool
 from .points.archives import read_array
 from .points.measured import in_space
+from .recording_toml import MeasuredRecording
 
 MAX_AGE = 100_000_000
 """Time before the first and after the last report for which that report still holds [ns], as a recording's reader has

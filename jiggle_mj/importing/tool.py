@@ -8,9 +8,9 @@ from jaxtyping import Float, Int
 from ..observation import IDENTITY_WXYZ, ToolReport, ToolState
 from .clock import FrameClock
 from .data_folder import DataFolder
-from .declaration import MeasuredRecording
 from .grasp_checks import refuse_wrong_grasps
 from .grasps import GraspSpan, read_grasps
+from .recording_toml import MeasuredRecording
 from .reports import Reports, read_reports
 
 

@@ -15,7 +15,7 @@ from ...likely_name import did_you_mean
 from ...observation import Declaration
 from ...recording.reader import PAIRING_TOLERANCE_NS
 from ...toml_kinds import StrictTable
-from ..declaration import parse_declaration_table
+from ..recording_toml import parse_declaration_table
 from .gripper import ClosedRule
 
 Role = Literal["left", "right", "left_info", "right_info", "tool", "gripper", "points", "depth", "depth_info", "force"]
