@@ -95,7 +95,9 @@ def _typed(value: Any, kind: Any, where: str) -> Any:
         if value in arguments:
             return value
         allowed = f"one of {', '.join(map(repr, arguments))}"
-    elif origin is tuple and isinstance(value, list | tuple):
+    elif origin is tuple and not isinstance(value, list | tuple):
+        allowed = "a list, such as [0, 0, -9.81]"
+    elif origin is tuple:
         items = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
         if len(items) == len(value):
             return tuple(_typed(item, each, where) for item, each in zip(value, items, strict=True))

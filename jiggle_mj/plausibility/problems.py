@@ -75,6 +75,12 @@ def _use(survey: Survey) -> Iterator[RecordingProblem]:
         return
     if survey.grasps == 1:
         yield _warn("one-grasp", "one grasp only: several, at different places, show more of the attachments.")
+    if survey.sensing == "cloud":
+        yield _warn(
+            "no-identities",
+            "points are not the same from frame to frame, as they have no track_id: attachments are found much less "
+            "well, and their intervals are too narrow.",
+        )
     if survey.missing_tracks:
         named = ", ".join(map(str, survey.missing_tracks[:5]))
         text = f"held tracks that no point has: {named}; give the numbers as in the points' track_id."

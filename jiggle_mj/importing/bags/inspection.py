@@ -101,6 +101,8 @@ def inspect_bag(path: Path, settings: BagSettings | None = None) -> BagReport:
             next_command=f"jiggle-mj estimate {path} --out out/estimate",
         )
     missing = missing_roles(roles, unsure, settings)
+    if "gripper" in roles and bag.topics[roles["gripper"].topic].type != "std_msgs/msg/Bool":
+        missing.append("when the jaws are closed: say it with --closed, for example --closed 'jaw<0.1' (docs/BAGS.md)")
     return BagReport(
         path=path,
         kind="ROS bag",

@@ -27,6 +27,7 @@ def test_inspect_lists_topics_and_what_is_missing(tmp_path, monkeypatch, capsys)
         write_images(bag)
         bag.pose("/psm1/measured_cp", 0, [0, 0, 0])
         bag.pose("/psm2/measured_cp", 0, [0, 0, 0])
+        bag.joint("/psm1/jaw", 0, jaw=0.6)
         bag.write("/odd", 0, "std_msgs/String", data="x")
     assert call(monkeypatch, "inspect", bag.path, "--json") == 0
     shown = capsys.readouterr()
@@ -37,7 +38,7 @@ def test_inspect_lists_topics_and_what_is_missing(tmp_path, monkeypatch, capsys)
     assert topics["/left/image_raw"]["rate"] == pytest.approx(10)
     assert topics["/left/image_raw"]["span"] == [0.0, 0.3] and topics["/left/image_raw"]["role"] == "left"
     assert topics["/tf_static"]["frames"] == ["left_optical > right_optical", "world > left_optical"]
-    assert len(report["missing"]) == 2 and "the state of the gripper" in report["missing"][1]
+    assert len(report["missing"]) == 2 and "--closed 'jaw<0.1'" in report["missing"][1]
 
 
 def test_inspect_reads_recordings_of_ours(tmp_path, monkeypatch, capsys):

@@ -25,6 +25,7 @@ def test_the_lines_of_python_find_the_attachments_of_the_sample(tmp_path, monkey
     attached = np.loadtxt("docs/recordings/sample/attached.txt", dtype=int)
     found = names["estimator"].track_ids[names["attached"]]
     assert len(np.intersect1d(found, attached)) >= 11 and len(found) <= 13
+    assert 1.5 < names["b"][names["attached"]].mean() < 6  # the sample's 3 N/m, within a factor of 2
 
 
 def test_the_sample_folder_is_imported_as_the_arrays_are(tmp_path):
