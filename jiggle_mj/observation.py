@@ -21,6 +21,11 @@ from .argument_checks import (
 )
 from .errors import ObservationError, OptionError
 
+MATERIAL_BOUNDS = {"membrane_stiffness": ("N/m", 1e8), "thickness": ("m", 0.1), "areal_density": ("kg/m^2", 1e3)}
+"""Unit and upper bound of each declared property: a millimetre of steel has 2e8 N/m, 0.1 m of tissue is no sheet, and
+1000 kg/m^2 is a metre of water. Beyond them a unit is wrong."""
+MAX_GRAVITY = 100.0
+"""Largest declared gravity [m/s^2]: ten times that of the Earth."""
 IDENTITY_WXYZ = np.array([1.0, 0.0, 0.0, 0.0])
 """Quaternion wxyz of the identity rotation."""
 MAX_PARTICLES = 20_000
@@ -261,8 +266,9 @@ class Declaration:
 
     def __post_init__(self) -> None:
         """Check types and ranges."""
-        for name, unit in (("membrane_stiffness", "N/m"), ("thickness", "m"), ("areal_density", "kg/m^2")):
-            store(self, **{name: as_number(getattr(self, name), f"Declaration.{name}", unit=unit, above=0)})
+        for name, (unit, below) in MATERIAL_BOUNDS.items():
+            number = as_number(getattr(self, name), f"Declaration.{name}", unit=unit, above=0, below=below)
+            store(self, **{name: number})
         poisson = as_number(self.poisson, "Declaration.poisson")
         if not 0 <= poisson < 0.5:
             raise OptionError(
@@ -270,6 +276,11 @@ class Declaration:
                 "(use 0.49 for nearly incompressible tissue)."
             )
         gravity = as_array(self.gravity, "Declaration.gravity [m/s^2]", (3,))
+        if not np.linalg.norm(gravity) <= MAX_GRAVITY:
+            raise OptionError(
+                f"Declaration.gravity must be at most {MAX_GRAVITY:g} m/s^2 long; got {quoted(self.gravity)}: is it in "
+                "mm/s^2?"
+            )
         store(self, poisson=poisson, gravity=tuple(gravity.tolist()), bed=as_flag(self.bed, "Declaration.bed"))
         if self.mesh is not None:
             as_instance(self.mesh, "Declaration.mesh", DeclaredMesh)

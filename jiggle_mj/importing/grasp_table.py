@@ -20,6 +20,8 @@ NEAR_TOOL = "near tool"
 """Value of `rows` that means: the points within the radius of the tool when the jaws close."""
 START_TOGETHER = "start together"
 """Value of `tool_clock_offset` that means: the first report belongs to the first frame."""
+MAX_SECONDS = 9e9
+"""Largest time in seconds that nanoseconds in 64 bits hold: clocks that count from 1970 are below it."""
 TOOL_KEYS = ("tool", "tool_times", "tool_turns", "tool_unit", "tool_time_unit", "tool_clock_offset")
 """Keys of the one tool; several `[[grasp]]` may repeat them."""
 PATH_KEYS = ("start", "direction", "step")
@@ -179,7 +181,7 @@ def _grasp(table: StrictTable) -> GivenGrasp:
     grasp = GivenGrasp(
         held=_held(table),
         radius=table.take("radius", kinds.positive, DEFAULT_GRASP_RADIUS),
-        after=table.take("after", kinds.not_negative, 0.0),
+        after=table.take("after", _duration, 0.0),
         run=table.take("run", _integer, None),
         begin=table.take("begin", kinds.number, None),
         end=table.take("end", kinds.number, None),
@@ -250,10 +252,21 @@ def _tool(tables: list[StrictTable]) -> ReportedTool | None:
 def _offset(value: Any) -> float | None:
     if value == START_TOGETHER:
         return None
+    allowed = f'a number of at most {MAX_SECONDS:g} [s], or "{START_TOGETHER}"'
     try:
-        return kinds.number(value)
+        seconds = kinds.number(value)
     except TypeError as failure:
-        raise TypeError(f'a number [s], or "{START_TOGETHER}"') from failure
+        raise TypeError(allowed) from failure
+    if abs(seconds) > MAX_SECONDS:
+        raise TypeError(allowed)
+    return seconds
+
+
+def _duration(value: Any) -> float:
+    seconds = kinds.not_negative(value)
+    if seconds > MAX_SECONDS:
+        raise TypeError(f"a number from 0 to {MAX_SECONDS:g} [s]")
+    return seconds
 
 
 def _integer(value: Any) -> int:

@@ -97,10 +97,11 @@ def constructors() -> Iterator[Use]:
     }
     yield from changed("DeclaredMesh", jm.DeclaredMesh, TRIANGLE, wrong)
     wrong = {
-        "membrane_stiffness": ABOVE_ZERO,
-        "thickness": ABOVE_ZERO[:6],
+        "membrane_stiffness": (*ABOVE_ZERO, 1e300),
+        "thickness": (*ABOVE_ZERO[:6], 1.0),
+        "areal_density": (0, 1e9),
         "poisson": (0.5, -0.1, NAN, "0.4", None),
-        "gravity": (-9.81, (0, 0), (0, 0, NAN), "down", None),
+        "gravity": (-9.81, (0, 0, -9810), (0, 0), (0, 0, NAN), "down", None),
         "bed": ("yes", None),
         "mesh": (TRIANGLE, "mesh.obj"),
     }

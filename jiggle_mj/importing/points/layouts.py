@@ -65,7 +65,9 @@ def frames_first(
             f'{name} must have shape (frames, points, 3); it has {shape}. Give the order of its axes: layout = "frames,'
             ' xyz, points", say.'
         )
-    if n_times is None:
+    if 0 in shape:
+        raise RecordingError(f"{name} has shape {shape}: it holds no position.")
+    if n_times is None or shape[0] == shape[1]:
         _refuse_points_first(array, name)
     elif n_times == shape[1] != shape[0]:
         raise RecordingError(

@@ -146,6 +146,14 @@ def test_times_decide_the_layout(tmp_path):
         read(where)
 
 
+def test_times_do_not_decide_between_as_many_frames_as_points(tmp_path):
+    values = np.concatenate([sheet(), np.repeat(sheet()[-1:], 9, axis=0)])  # 12 frames of 12 points
+    where = archive(tmp_path, 'key = "p"\ntimes = "t"', p=values.transpose(1, 0, 2), t=np.arange(12.0))
+    (where / "recording.toml").write_text((where / "recording.toml").read_text().replace("period = 0.5", ""))
+    with pytest.raises(RecordingError, match="points probably come first"):
+        read(where)
+
+
 def test_a_batch_of_one_and_separate_arrays_are_read(tmp_path):
     (tmp_path / "batch").mkdir()
     same(read(archive(tmp_path / "batch", 'key = "p"', p=sheet()[None])), np.zeros(SHAPE, bool))

@@ -27,6 +27,8 @@ from tests.support.measured_folder import TOML, bring_in, folder
         ("bed = false", "bed = 0", r"\[declaration\] bed must be true or false; got 0"),
         ("bed = false", "youngs = 3.0", r"\[declaration\] has the unknown key 'youngs'\. Known: areal_density"),
         ("bed = false", "poisson = 0.5", r"\[declaration\] Declaration.poisson must be in \[0, 0.5\)"),
+        ("gravity = [0.0, 0.0, 0.0]", "gravity = [0, 0, -9810]", "Declaration.gravity must be at most 100 m/s"),
+        ("rows = [0, 1]", "rows = [0, 1]\nafter = 1e300", r"\[grasp\] after must be a number from 0 to 9e\+09 \[s\]"),
         ("bed = false", "thickness = 0", r"\[declaration\] Declaration.thickness must be above 0"),
         ("rows = [0, 1]", "", r"\[grasp\] needs one of rows, rows_file, at"),
         ("rows = [0, 1]", 'rows = [0]\nrows_file = "r"', "both rows and rows_file"),
