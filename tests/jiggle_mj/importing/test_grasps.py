@@ -102,7 +102,7 @@ def test_one_list_for_pulls_at_two_corners_is_refused_with_the_cure(tmp_path, to
         (TOOL, "rows = [28, 29]\nafter = 5.0", "the jaws never close: after is 5 s"),
         (TOOL + '\ntool_unit = "m"', "rows = [28, 29]", 'the tool is 7.* m from the nearest.*tool_unit = "mm"'),
         (TOOL + "\ntool_clock_offset = 60", "rows = [28, 29]", 'do not overlap.*tool_clock_offset.*[(]0, or "start'),
-        (TOOL + '\ntool_clock_offset = "soon"', "rows = [28, 29]", 'must be a number .s., or "start together"'),
+        (TOOL + '\ntool_clock_offset = "soon"', "rows = [28, 29]", 'must be a number .*, or "start together"'),
     ],
 )
 def test_what_is_wrong_with_a_grasp_is_named(tmp_path, tool, second, message):
