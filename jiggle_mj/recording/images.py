@@ -8,6 +8,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from jaxtyping import Shaped, UInt8
 
+from ..camera import CameraCalibration
 from ..errors import MAX_SHOWN, RecordingError
 
 MAX_PIXELS = 50_000_000
@@ -105,6 +106,19 @@ def _to_rgb(
         return pixels.copy()
     refuse_small_bayer(encoding, pixels.shape[1], pixels.shape[0])
     return cv2.cvtColor(pixels, TO_RGB[encoding])
+
+
+def refuse_other_size(image: UInt8[np.ndarray, "height width 3"], calibration: CameraCalibration, topic: str) -> None:
+    """Refuse an image of another size than its calibration.
+
+    Raises:
+        RecordingError: the sizes differ.
+    """
+    height, width = image.shape[:2]
+    if (width, height) != (calibration.width, calibration.height):
+        raise RecordingError(
+            f"{topic} is {width}x{height} and its calibration {calibration.width}x{calibration.height}"
+        )
 
 
 def refuse_size(width: int, height: int) -> None:

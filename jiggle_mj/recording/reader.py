@@ -26,7 +26,7 @@ from ..observation import Declaration, MeasuredPoints, Observation, StereoPair, 
 from ..toml_kinds import MAX_COUNT
 from .contents import RecordingContents
 from .frames import transform_of_rotation
-from .images import decode_image
+from .images import decode_image, refuse_other_size
 from .pairing import MessageGroup, Stamped, group_messages, lone_jumps, stamp_gap
 from .schemas import parse_calibration, parse_points, parse_transform
 from .stored_arrays import MAX_LENGTH_M, StoredArrays
@@ -230,11 +230,7 @@ class ObservationReader:
                 image = decode_image(messages[topic])
             except RecordingError as failure:
                 raise RecordingError(f"{topic} {failure}") from failure
-            height, width = image.shape[:2]
-            if (width, height) != (calibration.width, calibration.height):
-                raise RecordingError(
-                    f"{topic} is {width}x{height} and its calibration {calibration.width}x{calibration.height}"
-                )
+            refuse_other_size(image, calibration, topic)
             decoded.append(image)
         return StereoPair(left=decoded[0], right=decoded[1])
 

@@ -18,6 +18,7 @@ from ...camera import StereoCamera
 from ...errors import OutputError, RecordingError
 from ...observation import MeasuredPoints, Observation, StereoPair, ToolState
 from ...recording.declaration import identity
+from ...recording.images import refuse_other_size
 from ...recording.reader import PAIRING_TOLERANCE_NS
 from ...recording.writer import RecordingWriter
 from ..complete_files import complete_files
@@ -199,11 +200,7 @@ def _image(prepared: Preparation, role: Role, read: dict[Role, Any]) -> UInt8[np
         image = rgb_image(read[role])
     except RecordingError as failure:
         raise RecordingError(f"{topic} {failure}") from failure
-    height, width = image.shape[:2]
-    if (width, height) != (calibration.width, calibration.height):
-        raise RecordingError(
-            f"{topic} is {width}x{height} and its calibration {calibration.width}x{calibration.height}"
-        )
+    refuse_other_size(image, calibration, topic)
     return image
 
 
