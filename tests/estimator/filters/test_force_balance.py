@@ -10,7 +10,19 @@ import pytest
 from jiggle_mj.estimator.filters.config import FilterConfig
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
-from tests.support.small_sheet import DECLARATION, attached, dense, lifts, sheet, sheet_balance, sheet_energy
+from jiggle_mj.estimator.physics.surrogate import surrogate
+from jiggle_mj.observation import Declaration
+from tests.support.small_sheet import (
+    DECLARATION,
+    attached,
+    dense,
+    equilateral,
+    jittered,
+    lifts,
+    sheet,
+    sheet_balance,
+    sheet_energy,
+)
 from tests.support.small_sheet import observed as evidence
 
 K = DECLARATION.membrane_stiffness
@@ -126,3 +138,23 @@ def test_evidence_only_sharpens(balance):
     values = np.linalg.eigvalsh(np.asarray(found.precision))
     rounding = 1e-9 * values.max()
     assert values.min() > -rounding and values.max() > 1e3
+
+
+def test_no_unseen_particle_is_less_certain_than_the_floor():
+    """A fine sheet without weight is held beyond its seen quarter: variances span twelve orders of magnitude."""
+    mesh = jittered(equilateral(30, 16, 1.5e-3), 0.1)
+    energy = surrogate(mesh, Declaration(gravity=(0.0, 0.0, 0.0), bed=False))
+    balance = ForceBalance.build(
+        mesh, energy, reference=K, force_sd=5e-5, force_level=FORCE_LEVEL, anchor_sd=ANCHOR_SD, grip_stiffness=3 * K
+    )
+    along = mesh.rest[:, 0] - mesh.rest[:, 0].min()
+    seen, from_tip = along < 11e-3, np.linalg.norm(mesh.rest - mesh.rest[along.argmax()] / 2, axis=1)
+    held, pulled = jnp.asarray(from_tip < 3e-3), jnp.asarray(from_tip < 6e-3)
+    sd = np.where(seen, 2e-5, 1.5e-3)[:, None, None]
+    precision = jnp.asarray(np.where((seen | np.asarray(held))[:, None, None], np.eye(3) / sd**2, 0.0))
+    x = jnp.asarray(mesh.rest)
+    evidence = Evidence(y=x, precision=precision, held=held, force_unknown=pulled)
+    fit = eqx.filter_jit(lambda: balance.fit(balance.linearise(x, jnp.zeros(mesh.n), evidence)))()
+    variance = np.diagonal(np.asarray(fit.covariance.diagonal), axis1=1, axis2=2)
+    assert 0 < variance.min() < 1e-9
+    assert 0.1 < variance.max() <= 1 / CONFIG.position_precision_floor + 1e-6
