@@ -59,7 +59,8 @@ def _check_rotation(R: Float[np.ndarray, "3 3"], where: str) -> None:
     """
     bounded = np.abs(R).max() <= 1 + ORTHONORMAL  # products of larger numbers may overflow
     if not bounded or np.abs(R.T @ R - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(R) < 0:
-        raise ObservationError(f"{where} must be a rotation matrix; got {R.round(4).tolist()}.")
+        shown = ", ".join(f"[{', '.join(f'{x:.4g}' for x in row)}]" for row in R)
+        raise ObservationError(f"{where} must be a rotation matrix; got [{shown}].")
 
 
 @dataclass(frozen=True, kw_only=True)

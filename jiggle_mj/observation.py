@@ -3,6 +3,7 @@
 World frame: z up, SI units, times in integer nanoseconds from 0.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -276,7 +277,7 @@ class Declaration:
                 "(use 0.49 for nearly incompressible tissue)."
             )
         gravity = as_array(self.gravity, "Declaration.gravity [m/s^2]", (3,))
-        if not np.linalg.norm(gravity) <= MAX_GRAVITY:
+        if not math.hypot(*gravity) <= MAX_GRAVITY:
             raise OptionError(
                 f"Declaration.gravity must be at most {MAX_GRAVITY:g} m/s^2 long; got {quoted(self.gravity)}: is it in "
                 "mm/s^2?"

@@ -42,7 +42,8 @@ class StoredArrays:
         values = self._taken(name, shape)
         if values.dtype.kind not in "fiub":
             self._refuse(name, "real numbers", f"{values.dtype}")
-        values = values.astype(float)
+        with np.errstate(invalid="ignore"):  # raised by a signalling NaN
+            values = values.astype(float)
         if finite and not np.isfinite(values).all():
             self._refuse(name, "finite numbers", "NaN or infinity")
         return values
@@ -54,8 +55,9 @@ class StoredArrays:
             RecordingError: as in `numbers`, or a coordinate is larger.
         """
         values = self.numbers(name, shape, finite=finite)
-        if (np.abs(values) > MAX_LENGTH_M).any():
-            self._refuse(name, f"coordinates within {MAX_LENGTH_M:g} m", f"{np.nanmax(np.abs(values)):.3g}")
+        size = np.abs(values)
+        if (too_large := size > MAX_LENGTH_M).any():
+            self._refuse(name, f"coordinates within {MAX_LENGTH_M:g} m", f"{size[too_large].max():.3g}")
         return values
 
     def indices(self, name: str, shape: tuple[int | None, ...], *, below: int, from_: int = 0) -> np.ndarray:
