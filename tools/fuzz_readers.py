@@ -25,6 +25,7 @@ from jiggle_mj.errors import JiggleError
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.support.damaged_files import READERS, Reader, damaged
+from tests.support.damaged_imports import IMPORTS
 
 HANG_S = 10
 """Time after which a reading counts as a hang [s]."""
@@ -32,6 +33,10 @@ MEMORY_BYTES = 2 << 30
 """Memory that a reading may need [byte]."""
 MAX_MESSAGE = 1000
 """Longest message of an error [characters]: 200 of the content, twice, and the path."""
+
+
+ALL = READERS | IMPORTS
+"""Each reader and each import by its name."""
 
 
 class Hang(BaseException):
@@ -43,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=1000, help="inputs for each reader")
-    parser.add_argument("--reader", nargs="*", choices=list(READERS), default=list(READERS))
+    parser.add_argument("--reader", nargs="*", choices=list(ALL), default=list(ALL))
     parser.add_argument("--keep", type=Path, help="folder for the first input of each kind of raw error")
     arguments = parser.parse_args()
     warnings.simplefilter("error")
@@ -52,7 +57,7 @@ def main() -> None:
     faults = 0
     with tempfile.TemporaryDirectory() as folder:
         for name in arguments.reader:
-            faults += fuzz(name, READERS[name](Path(folder)), arguments.seed, arguments.count, arguments.keep)
+            faults += fuzz(name, ALL[name](Path(folder)), arguments.seed, arguments.count, arguments.keep)
     sys.exit(min(faults, 1))
 
 

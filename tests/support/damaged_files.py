@@ -72,6 +72,23 @@ membrane_stiffness = 20
 force = 0.01
 """
 """A valid scene file."""
+WORDS = (
+    b"nan",
+    b"1e999",
+    b"-1",
+    b"99999999999",
+    b",",
+    b";",
+    b"\t",
+    b"\n",
+    b'"',
+    b"\0",
+    b"#",
+    b"\xff\xfe",
+    b"{",
+    b"1,5",
+)
+"""What damage inserts that means something in a text."""
 PROTOBUF = {
     "foxglove.PointCloud": PointCloud,
     "foxglove.PoseInFrame": PoseInFrame,
@@ -101,6 +118,8 @@ def damaged(reader: Reader, generator: random.Random) -> tuple[str, bytes]:
         text_like = reader.path.suffix in (".json", ".toml")
         if text_like and generator.random() < 0.7:
             return "meaning", _other_text(reader.valid, generator)
+        if reader.path.suffix == ".npz" and generator.random() < 0.5:
+            return "meaning", _other_arrays(reader.valid, generator)
         return "bytes", _other_bytes(reader.valid, generator)
     kind = generator.choice(("bytes", "structure", "meaning", "meaning"))
     if kind == "bytes":
@@ -113,7 +132,7 @@ def damaged(reader: Reader, generator: random.Random) -> tuple[str, bytes]:
 
 def _other_bytes(data: bytes, generator: random.Random) -> bytes:
     changed, at = bytearray(data), generator.randrange(len(data))
-    match generator.randrange(6):
+    match generator.randrange(7):
         case 0:
             for _ in range(generator.choice((1, 1, 2, 8, 64))):
                 changed[generator.randrange(len(changed))] ^= 1 << generator.randrange(8)
@@ -128,6 +147,8 @@ def _other_bytes(data: bytes, generator: random.Random) -> bytes:
             changed[at : at + 8] = struct.pack(
                 "<Q", generator.choice((0, 1, 2**31, 2**32 - 1, 2**40, 2**63, 2**64 - 1))
             )
+        case 5:
+            changed[at:at] = generator.choice(WORDS)
         case _:
             length = generator.choice((1, 4, 16, 256))
             changed[at : at + length] = generator.randbytes(length)
