@@ -124,21 +124,57 @@ def test_faces_that_count_from_one_are_asked_for(tmp_path):
         bring_in(where)
 
 
-@pytest.mark.parametrize(
-    ("names", "note"),
-    [
-        (["f_9", "f_10", "f_11"], ("frames are in the order of their numbers: f_9.xyz before f_10.xyz",)),
-        (["f_09", "f_10", "f_11"], ()),
-        (["a2_f9", "a2_f10", "a10_f1"], ("frames are in the order of their numbers: a2_f9.xyz before a2_f10.xyz",)),
-    ],
+ORDERED = (
+    "f_9 f_10 f_11",
+    "f_09 f_10 f_11",
+    "f-1 f-2 f-10",
+    "f.9 f.10 f.11",
+    "t0.5 t1 t1.5",
+    "f9_t0.5 f10_t1.0 f11_t1.5",
+    "2024-01-31 2024-02-01 2024-10-01",
+    "2024-01-31_10-59-58 2024-01-31_11-00-01 2024-02-01_00-00-00",
+    "20240131_235958 20240201_000001 20240201_000002",
 )
-def test_frame_files_are_in_the_order_of_their_numbers(tmp_path, names, note):
-    where = folder(tmp_path, toml=TOML.replace(FILES, 'files = ["?*_*.xyz"]').replace("?*_*", "[af]*"))
-    for name, points in zip(names, frames(), strict=True):
-        np.savetxt(where / f"{name}.xyz", points)
+"""Names in the order of time, which they state."""
+UNCLEAR = (
+    ("f-1 f0 f1", "differ in more than a number"),
+    ("t10ms t1s t2s", "differ in more than a number"),
+    ("t1e-3 t2e-3 t1e-2", "differ in more than a number"),
+    ("t12am t1am t2am", "differ in more than a number"),
+    ("f_one f_two f_three", "differ in more than a number"),
+    ("f1 f2 f2(1)", "differ in more than a number"),
+    ("f1 f01 f2", "have the same number"),
+    ("30-01-2024 31-01-2024 01-02-2024", "several numbers"),
+    ("a2_f9 a2_f10 a10_f1", "several numbers"),
+    ("t_0.5 t_0.25 t_1.0", "different counts of decimals"),
+)
+"""Names whose order is a guess, and what the refusal says."""
+
+
+def named(tmp_path, names: str):
+    """A folder whose frames have those names."""
+    where = folder(tmp_path, toml=TOML.replace(FILES, 'files = ["[aft023]*"]'))
+    for name, points in zip(names.split(), frames(), strict=True):
+        np.savetxt(where / (name if name.startswith("f.") else f"{name}.xyz"), points)
+    return where
+
+
+@pytest.mark.parametrize("names", ORDERED)
+def test_frame_files_are_in_the_order_of_their_numbers(tmp_path, names):
+    where = named(tmp_path, names)
+    by_name = sorted(path.name for path in where.glob("[aft023]*"))
     summary, recording = bring_in(where)
-    assert [observation.points.positions[5, 2] for observation in recording] == [5.125e-3, 5.125e-3, 5.625e-3]
-    assert summary.notes == note
+    assert [observation.points.positions[0, 2] for observation in recording] == [5.125e-3, 8.125e-3, 8.625e-3]
+    reordered = [name.removesuffix(".xyz") for name in by_name] != names.split()
+    assert [note.partition(":")[0] for note in summary.notes] == [
+        "frames are in the order of their numbers"
+    ] * reordered
+
+
+@pytest.mark.parametrize(("names", "why"), UNCLEAR)
+def test_names_without_a_clear_order_are_refused_with_the_cure(tmp_path, names, why):
+    with pytest.raises(RecordingError, match=f"{why}.*list them in the order of time in .points. files"):
+        bring_in(named(tmp_path, names))
 
 
 def test_a_list_in_the_order_of_names_is_kept_and_said(tmp_path):
@@ -148,18 +184,10 @@ def test_a_list_in_the_order_of_names_is_kept_and_said(tmp_path):
     assert bring_in(where)[0].notes == ("the order of [points] files is kept: f_10.xyz before f_2.xyz",)
 
 
-def test_times_of_several_lengths_in_names_are_asked_for(tmp_path):
-    where = folder(tmp_path, toml=TOML.replace(FILES, 'files = ["t_*.xyz"]'))
-    for name in ("0.5", "0.25", "1.0"):
-        np.savetxt(where / f"t_{name}.xyz", grid())
-    with pytest.raises(RecordingError, match="decimal numbers of several lengths"):
-        bring_in(where)
-
-
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ('["rest.xyz", "*.xyz"]', "names rest.xyz twice"),
+        ('["rest.xyz", "r*.xyz"]', "names rest.xyz twice"),
         ('["sub"]', "is a folder"),
         ('["rest.xyz", "d.npy"]', "files of different kinds"),
         ('["short.pcd"]', r"cannot be read as \.pcd"),
