@@ -26,6 +26,7 @@ from .declared_mesh import declared_mesh
 from .known_attachments import measured_truth
 from .point_files import read_frames
 from .points.archives import read_array
+from .points.headings import PIXELS
 from .points.measured import PointFrames
 from .recording_toml import MeasuredRecording, read_recording_toml
 from .tool import Tool
@@ -91,9 +92,10 @@ def import_folder(
     data = DataFolder(path=folder, allow_outside=allow_outside)
     given = read_recording_toml(folder / "recording.toml" if recording_toml is None else Path(recording_toml))
     found = read_frames(data, given.points)
+    _refuse_unit(found, given)
     frames, names, steps = _frames_in_world(found, given)
     rest = frames[0]
-    clock = _clock(data, given, len(frames))
+    clock = _clock(data, given, found)
     mesh = declared_mesh(data, given, rest, found.notes)
     vertices = None if mesh is None else mesh.vertices
     tool = Tool.read(data, given, frames, names=names, steps=steps, clock=clock, vertices=vertices)
@@ -176,12 +178,30 @@ def _refuse_extent(rest: Float[np.ndarray, "n 3"], given: MeasuredRecording) -> 
     )
 
 
-def _clock(folder: DataFolder, given: MeasuredRecording, count: int) -> FrameClock:
+def _clock(folder: DataFolder, given: MeasuredRecording, found: PointFrames) -> FrameClock:
     points = given.points
     return frame_clock(
-        count=count,
+        count=len(found.positions),
         period=given.period,
-        times=None if points.times is None else read_array(folder / points.files[0], points.times),
+        times=found.times,
         unit=given.time_unit,
         runs=None if points.runs is None else read_array(folder / points.files[0], points.runs),
     )
+
+
+def _refuse_unit(found: PointFrames, given: MeasuredRecording) -> None:
+    """Refuse a unit that contradicts that of headings or of the arrays' names."""
+    other = next(iter(sorted(found.units - {given.unit_name})), None)
+    if other == PIXELS:
+        raise RecordingError(
+            "headings or names of arrays say that the points are in pixels, which are no length. Give points in space, "
+            "from stereo or a depth camera; or, of a flat sheet seen from above, pixels times the mm of one."
+        )
+    if other is not None:
+        cure = (
+            f'give unit = "{other}"' if other in LENGTH_UNITS else f"convert them to one of {', '.join(LENGTH_UNITS)}"
+        )
+        raise RecordingError(
+            f'unit = "{given.unit_name}", but headings or names of arrays say that the points are in {other}: {cure}, '
+            "or correct the names."
+        )

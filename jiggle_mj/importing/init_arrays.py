@@ -73,7 +73,7 @@ def guess_arrays(folder: Path, points: GuessedPoints) -> GuessedArrays:
                 return key
         return None
 
-    times = first(TIME, (n_frames,), but=TOOL)
+    times = points.files.times or first(TIME, (n_frames,), but=TOOL)
     tool = first(TOOL, (-1, 3), (-1, 2), but=re.compile(f"{TIME.pattern}|{TURN.pattern}|{FACE.pattern}", re.I))
     runs = first(RUN, (n_frames,), but=TIME) if times is not None else None
     faces = first(FACE, (-1, 3), but=TOOL)
@@ -86,10 +86,11 @@ def guess_arrays(folder: Path, points: GuessedPoints) -> GuessedArrays:
         tool_turns = first(TURN, (n_reports, 4))
         if tool_times is None and n_reports != n_frames:
             tool = tool_turns = None
-    time_unit, why = ("s", "") if times is None else _time_unit(times, read_array(archive, times))
+    frame_times = read_array(archive, times) if times is not None and points.times is None else points.times
+    time_unit, why = ("s", "") if times is None or frame_times is None else _time_unit(times, frame_times)
     tool_time_unit, apart = time_unit, False
-    if times is not None and tool_times is not None:
-        frame_times, report_times = read_array(archive, times), read_array(archive, tool_times)
+    if frame_times is not None and tool_times is not None:
+        report_times = read_array(archive, tool_times)
         stated = TIME_SUFFIX.search(tool_times)
         tool_time_unit = time_unit if stated is None else stated[1]
         apart = _apart(frame_times, TIME_UNITS[time_unit], report_times, TIME_UNITS[tool_time_unit])

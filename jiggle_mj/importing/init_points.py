@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from ..errors import RecordingError
 from .data_folder import DataFolder, quoted
@@ -33,6 +33,10 @@ class GuessedPoints:
     """What `[points]` must say."""
     positions: Float[np.ndarray, "t n 3"]
     """All frames in the unit of the data."""
+    units: frozenset[str]
+    """Units that headings or names of arrays state."""
+    times: Shaped[np.ndarray, " t"] | None
+    """Times of the frames from a column of the text; None for none."""
     arrays: dict[str, tuple[int, ...]]
     """Name and shape of each array of the archive; empty for files of one frame each."""
     notes: list[str]
@@ -68,10 +72,12 @@ def guess_points(folder: Path) -> GuessedPoints:
 def guess_unit(points: GuessedPoints) -> tuple[str, str]:
     """Return the unit of the data, and why: the name of the array states it, or the extent of the sheet fits it."""
     key = points.files.key
-    stated = UNIT_SUFFIX.search(key) if isinstance(key, str) else None
+    suffix = UNIT_SUFFIX.search(key) if isinstance(key, str) else None
+    stated = points.units | ({suffix[1]} if suffix else set())
     extent = float(np.nanmax(np.ptp(_finite(points.positions[0]), axis=0)))
-    if stated is not None:
-        return stated[1], f"as the name {key} says; the sheet is {extent * LENGTH_UNITS[stated[1]]:.3g} m large"
+    for unit in sorted(stated & LENGTH_UNITS.keys()):
+        name = "headings say" if key is None else f"name {key} says"
+        return unit, f"as the {name}; the sheet is {extent * LENGTH_UNITS[unit]:.3g} m large"
     low, high = LIKELY_EXTENT
     for unit in PREFERRED_UNITS:
         if low <= extent * LENGTH_UNITS[unit] <= high:
@@ -105,13 +111,15 @@ def _of_archives(folder: Path, names: list[str], failures: list[str]) -> list[Po
 
 
 def _of_frames(names: list[str]) -> list[PointFiles]:
-    """Return candidates of files of one frame each: names that differ in their numbers alone, the most files first."""
+    """Return candidates: files of one frame each, whose names differ in their numbers alone; then single tables."""
     groups: dict[str, list[str]] = {}
     for name in names:
         if Path(name).suffix.lower() in FRAMES:
             groups.setdefault(re.sub(r"\d+", "*", name), []).append(name)
     ordered = sorted(groups.items(), key=lambda item: -len(item[1]))
-    return [PointFiles(files=(pattern,)) for pattern, members in ordered if len(members) >= 2 and "[" not in pattern]
+    several = [PointFiles(files=(key,)) for key, members in ordered if len(members) >= 2 and "[" not in key]
+    alone = [PointFiles(files=(members[0],)) for _, members in ordered if len(members) == 1]
+    return [*several, *alone]
 
 
 def _first_readable(folder: Path, files: PointFiles, failures: list[str]) -> GuessedPoints | None:
@@ -130,6 +138,22 @@ def _first_readable(folder: Path, files: PointFiles, failures: list[str]) -> Gue
         except RecordingError as failure:
             failures.append(str(failure))
             continue
+        if found.time_heading is not None and way.times is None:
+            try:
+                found, way = (
+                    read_frames(DataFolder(path=folder), timed := replace(way, times=found.time_heading)),
+                    timed,
+                )
+            except RecordingError as failure:
+                failures.append(str(failure))
         if len(found.positions) >= 2 and len(_finite(found.positions[0])) >= 3:
-            return GuessedPoints(files=way, positions=found.positions, arrays=shapes, notes=found.notes, layout=layout)
+            return GuessedPoints(
+                files=way,
+                positions=found.positions,
+                units=found.units,
+                times=found.times,
+                arrays=shapes,
+                notes=found.notes,
+                layout=layout,
+            )
     return None

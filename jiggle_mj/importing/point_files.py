@@ -40,12 +40,25 @@ def read_frames(folder: DataFolder, points: PointFiles) -> PointFrames:
     if measured.positions.shape[2] == 2:
         notes.append("points have two coordinates: they lie in the plane z = 0")
     positions = _without_unseen(positions, measured, points)
-    return PointFrames(positions=positions, names=measured.names, notes=[*notes, *measured.notes])
+    return PointFrames(
+        positions=positions,
+        times=measured.times,
+        time_heading=measured.time_heading,
+        units=measured.units,
+        names=measured.names,
+        notes=[*notes, *measured.notes],
+    )
 
 
 def _read(paths: list[Path], kind: FileKind, points: PointFiles) -> Measured:
     if kind == "text":
         return read_text_frames(paths, points)
+    if points.frame_column is not None or points.track_column is not None:
+        raise RecordingError(
+            f"[points] frame_column and track_column are for text files; {paths[0].name} is read as {kind}."
+        )
+    if points.times is not None and kind not in ("npz", "mat"):
+        raise RecordingError(f"[points] times is for .npz, .mat and text files; {paths[0].name} is read as {kind}.")
     if kind in ("ply", "obj", "pcd"):
         return read_mesh_frames(paths, kind, points)
     return read_array_frames(paths, points)

@@ -10,6 +10,7 @@ from ...errors import RecordingError
 from ..data_folder import quoted
 from .archives import array_shapes, describe, read_array
 from .file_kinds import refuse_many
+from .headings import stated_units
 from .layouts import FRAMES_FIRST, frames_first
 from .measured import Measured
 from .missing_rule import AXES
@@ -59,6 +60,8 @@ def read_array_frames(paths: list[Path], points: PointFiles) -> Measured:
         notes.append(f"{key}: {how}{', and taken as its opposite' if negated else ''}; {int((~seen).sum())} are unseen")
     return Measured(
         positions=positions,
+        times=times,
+        units=stated_units(str(key) for key in _keys(points.key)),
         displacements=_displacements(path, points, positions),
         rule_values=_rule_values(path, points, positions, swapped),
         seen=seen,
@@ -171,6 +174,7 @@ def _one_a_frame(paths: list[Path], points: PointFiles) -> Measured:
         raise RecordingError(f"[points] missing names '{quoted(rule)}'; with a file a frame it may name x, y or z.")
     return Measured(
         positions=positions,
+        units=stated_units(str(key) for key in _keys(points.key)),
         rule_values=None if rule is None else positions[:, :, AXES.index(rule)],
         names=[path.name for path in paths],
         notes=[],

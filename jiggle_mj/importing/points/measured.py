@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
 from ...errors import RecordingError
 
@@ -14,6 +14,12 @@ class PointFrames:
 
     positions: Float[np.ndarray, "t n 3"]
     """Positions in the unit of the data; NaN where a point was not seen."""
+    times: Shaped[np.ndarray, " t"] | None
+    """Times of the frames in the unit of the data, as they are stored; None for none."""
+    time_heading: str | None
+    """Heading of the column of a text table that gives the frames' times; None for none."""
+    units: frozenset[str]
+    """Units of length that headings or names of arrays state, of `headings.LENGTHS`."""
     names: list[str]
     """Name of each frame, for messages."""
     notes: list[str]
@@ -26,6 +32,12 @@ class Measured:
 
     positions: Float[np.ndarray, "t n c"]
     """Positions in space, or in a plane."""
+    times: Shaped[np.ndarray, " t"] | None = None
+    """Times of the frames in the unit of the data, as they are stored; None for none."""
+    time_heading: str | None = None
+    """Heading of the column of a text table that gives the frames' times; None for none."""
+    units: frozenset[str] = frozenset()
+    """Units of length that headings or names of arrays state, of `headings.LENGTHS`."""
     displacements: Float[np.ndarray, "t n c"] | None = None
     """Displacements that the user, or the format, names; None for none."""
     by_format: bool = False

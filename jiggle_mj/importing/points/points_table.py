@@ -36,13 +36,18 @@ class PointFiles:
     layout: Layout | None = None
     """Order of the positions' axes; None for frames, points, xyz, which is then checked for plausibility."""
     times: str | None = None
-    """Name of the frames' times in the archive, shape (frames,) [s]; None for frames at a constant period."""
+    """Name of the frames' times in the archive, shape (frames,), or heading of their column in a text file; None for
+    frames at a constant period."""
     runs: str | None = None
     """Name of an array in the archive, shape (frames,): integers that change where another grasp begins; None for one
     grasp."""
     columns: tuple[int | str, ...] | None = None
     """Columns of x, y, z in a text file, by number from 0 or by heading; None for those that the heading names, or the
     first three. Two columns are points of a plane."""
+    frame_column: int | str | None = None
+    """Column that numbers the frames of a single text file, `NONE`, or None for the one that the heading names."""
+    track_column: int | str | None = None
+    """Column that names the points in text files, `NONE`, or None for the one that the heading names."""
     separator: str | None = None
     """Character between the cells of a text file; a blank stands for blanks and tabs; None to find it."""
     decimal: str | None = None
@@ -74,6 +79,8 @@ def read_points_table(table: StrictTable) -> PointFiles:
         key=table.take("key", _text_or_texts, None),
         layout=None if layout is None else read_layout(layout, table.where),
         columns=table.take("columns", _columns, None),
+        frame_column=table.take("frame_column", _column, None),
+        track_column=table.take("track_column", _column, None),
         separator=separator,
         decimal=table.take("decimal", _decimal, None),
         displacements=table.take("displacements", _names, None),
@@ -98,9 +105,9 @@ def _refuse_contradictions(points: PointFiles, where: str) -> None:
         raise RecordingError(
             f"{where} key names the array of an .npz or .mat, and only that; files are {kinds.shown(points.files)}."
         )
-    if not archive and (points.times or points.runs or points.visibility):
+    if not archive and (points.runs or points.visibility):
         raise RecordingError(
-            f"{where} times, runs and visibility name arrays of an .npz; files are {kinds.shown(points.files)}."
+            f"{where} runs and visibility name arrays of an .npz; files are {kinds.shown(points.files)}."
         )
     if points.times and points.rest:
         raise RecordingError(f"{where} rest must be 0 where frames have times; got {points.rest}.")
@@ -161,11 +168,22 @@ def _columns(value: Any) -> tuple[int | str, ...]:
     kind = "three columns, or two of a plane, each a whole number from 0 or a heading"
     if not isinstance(value, list) or len(value) not in (2, 3):
         raise TypeError(kind)
-    if not all(isinstance(item, str) or (type(item) is int and item >= 0) for item in value):
+    if not all(_is_column(item) for item in value):
         raise TypeError(kind)
     if len(set(value)) != len(value):
         raise TypeError(f"different columns, for x, y and z: {kind}")
     return tuple(value)
+
+
+def _column(value: Any) -> int | str:
+    """Return a column, by number or by heading."""
+    if not _is_column(value):
+        raise TypeError(f'a column, as a whole number from 0 or a heading, or "{NONE}"')
+    return value
+
+
+def _is_column(value: Any) -> bool:
+    return isinstance(value, str) or (type(value) is int and value >= 0)
 
 
 def _names(value: Any) -> tuple[int | str, ...]:

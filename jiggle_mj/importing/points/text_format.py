@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from ...errors import RecordingError
 from ..data_folder import quoted
 from .cells import THOUSANDS, is_number, is_unseen, parse_cell
+from .headings import are_units, plain_heading
+from .missing_rule import AXES
 from .text_lines import TextLines
 
 BLANKS = " "
@@ -21,8 +23,6 @@ SAMPLE_LINES = 1000
 """Lines by which a format is found; the reader then checks all of them."""
 MIN_COLUMNS = 2
 """Columns of a table of points: those of a plane."""
-UNIT_WORDS = frozenset("m mm cm um µm μm px pix pixel pixels s ms deg rad 1 - % none".split()) | {""}
-"""What a line of units below a heading holds, without its brackets."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +53,8 @@ class Sample:
     """The format."""
     names: list[str]
     """Headings of the columns; empty where there are none that fit."""
+    units: list[str]
+    """Cells of the line of units below the heading; empty where there is none."""
     commented: bool = False
     """Whether the headings are those of a comment, which need not be a heading."""
     first: int
@@ -75,15 +77,17 @@ def take_sample(text: TextLines, fmt: TextFormat) -> Sample:
     if first == len(cells):
         raise RecordingError(f"{text.path} holds no rows of numbers.")
     if first == 0 and len(cells) > 1 and _is_numbering(cells[0], cells[1:]):
-        return Sample(format=fmt, names=cells[0], first=1, rows=cells[1:])
-    width, names = len(cells[first]), list[str]()
+        return Sample(format=fmt, names=cells[0], units=[], first=1, rows=cells[1:])
+    width, names, units = len(cells[first]), list[str](), list[str]()
     for number, row in enumerate(cells[:first]):
-        if len(row) == width and names and not _are_units(row):
-            line, content = text.lines[number]
-            raise RecordingError(
-                f"{text.path} line {line} holds text that is not a number ('{quoted(content)}'), below a heading."
-            )
-        if len(row) == width and not names:
+        if len(row) == width and names:
+            if not are_units(row):
+                line, content = text.lines[number]
+                raise RecordingError(
+                    f"{text.path} line {line} holds text that is not a number ('{quoted(content)}'), below a heading."
+                )
+            units = row
+        elif len(row) == width:
             if len(set(row)) == 1:  # headings differ: this is a row, with a word for a lost point that is not known
                 raise RecordingError(
                     f"{text.path} line {text.lines[number][0]} holds text that is not a number ('{quoted(row[0])}')."
@@ -94,7 +98,12 @@ def take_sample(text: TextLines, fmt: TextFormat) -> Sample:
     comment = fmt.split(text.last_comment) if not names and text.last_comment is not None else []
     commented = len(comment) == width and not any(is_number(cell, fmt.decimal) for cell in comment)
     return Sample(
-        format=fmt, names=comment if commented else names, commented=commented, first=first, rows=cells[first:]
+        format=fmt,
+        names=comment if commented else names,
+        units=units,
+        commented=commented,
+        first=first,
+        rows=cells[first:],
     )
 
 
@@ -154,17 +163,20 @@ def _numbers(sample: Sample, columns: Sequence[int | str] | None, text: TextLine
 
 
 def column_numbers(sample: Sample, columns: Sequence[int | str] | None, where: str) -> list[int]:
-    """Return the numbers of columns that are given by number or heading; of the first three where none are given.
+    """Return the numbers of columns that are given by number or heading.
 
+    Without any they are those headed x, y and z, or the first three.
     Headings are compared without regard to case, blanks at their ends and a unit in brackets.
 
     Raises:
         RecordingError: no heading, or more than one, has a given name.
     """
-    wanted = range(min(3, len(sample.rows[0]))) if columns is None else columns
     plain = [plain_heading(name) for name in sample.names]
+    if columns is None:
+        headed = all(plain.count(axis) == 1 for axis in AXES)
+        return [plain.index(axis) for axis in AXES] if headed else list(range(min(3, len(sample.rows[0]))))
     numbers = []
-    for column in wanted:
+    for column in columns:
         if isinstance(column, str):
             found = [number for number, name in enumerate(plain) if name == plain_heading(column)]
             exact = [number for number in found if sample.names[number] == column]
@@ -177,11 +189,6 @@ def column_numbers(sample: Sample, columns: Sequence[int | str] | None, where: s
             column = found[0]
         numbers.append(column)
     return numbers
-
-
-def plain_heading(name: str) -> str:
-    """Return a heading in lower case, without a unit in brackets."""
-    return name.split("[")[0].split("(")[0].strip(' "').lower() or name.strip(' "').lower()
 
 
 def _is_row(cells: list[str], fmt: TextFormat) -> bool:
@@ -197,10 +204,6 @@ def _is_numbering(cells: list[str], rest: list[list[str]]) -> bool:
     numbers = cells[1:] if cells[0] == "" else cells
     counts = len(numbers) >= MIN_COLUMNS and numbers == [str(number) for number in range(len(numbers))]
     return counts and any("." in cell for row in rest for cell in row)
-
-
-def _are_units(cells: list[str]) -> bool:
-    return all(cell.strip("[]() ").lower() in UNIT_WORDS for cell in cells)
 
 
 def _shorter_heading(names: list[str], rows: list[list[str]]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Frames of tracked points in text tables, one file a frame."""
+"""Frames of tracked points in text tables: one file a frame, or one file with a column that numbers the frames."""
 
 from pathlib import Path
 
@@ -9,49 +9,55 @@ from ...errors import RecordingError
 from ..data_folder import quoted
 from .dic_formats import DIC_FORMATS, DISPLACEMENT_HEADINGS
 from .file_kinds import refuse_many
+from .headings import plain_heading, stated_units
 from .measured import Measured
 from .missing_rule import AXES, MissingRule
 from .points_table import PointFiles
-from .text_format import TextFormat, plain_heading
+from .row_keys import Column, RowKeys
+from .text_format import TextFormat, column_numbers
 from .text_lines import read_lines
 from .text_table import TextTable
-
-Column = int | str
+from .tracks import FrameRows, joined_tracks
 
 
 def read_text_frames(paths: list[Path], points: PointFiles) -> Measured:
     """Return the contents of text files, which all have the format and the columns of the first.
 
+    A file is one frame, unless it is the only one and a column numbers its frames.
+
     Raises:
-        RecordingError: a file is no table, lacks a column, or the files differ in their number of rows.
+        RecordingError: a file is no table, lacks a column, or the frames differ in their points.
     """
     first = _open(paths[0], points, None)
-    columns, notes = _position_columns(first, points)
+    keys = RowKeys.of(first, points)
+    columns, notes = _position_columns(first, points, keys)
     displacements = _displacement_columns(first, points)
     rule = missing_rule(points)
     rule_column = _rule_column(first, rule, columns, by_format=points.missing is None)
     wanted = [*columns, *displacements, *([] if rule_column is None else [rule_column])]
     refuse_many(len(paths), len(first.text.lines) - first.sample.first)
-    frames = [_read(path, points, first, wanted, number) for number, path in enumerate(paths)]
-    for path, frame in zip(paths, frames, strict=True):
-        if len(frame) != len(frames[0]):
-            raise RecordingError(
-                f"the frames differ in their number of points: {paths[0].name} has {len(frames[0])} rows, {path.name} "
-                f"has {len(frame)}; row i must be the same point in every file, empty or nan where it is lost."
-            )
-    values = np.stack(frames)
+    frames: list[FrameRows] = []
+    for number, path in enumerate(paths):
+        table = first if number == 0 else _open_alike(path, points, first)
+        frames += keys.frames(table, keys.rows(table, wanted), alone=len(paths) == 1)
+    if len(frames) == 1:
+        notes.append("one text file is one frame; where it holds several, give frame_column in [points]")
+    values, matched = joined_tracks(frames, keys.track_name)
     n = len(columns)
     if points.columns is None and points.format is None:
         _refuse_row_numbers(values[0, :, 0], first)
     return Measured(
         positions=values[:, :, :n],
+        times=keys.split_times(frames),
+        time_heading=keys.time_heading,
+        units=_units(first, [*columns, *displacements]),
         displacements=values[:, :, n : 2 * n] if displacements else None,
         by_format=points.format is not None,
-        rule_values=None if rule_column is None else values[:, :, -1],
+        rule_values=None if rule_column is None else values[:, :, len(wanted) - 1],
         unused_displacements=() if displacements else _unused_displacements(first, columns),
         headings=tuple(first.sample.names),
-        names=[path.name for path in paths],
-        notes=notes,
+        names=[frame.name for frame in frames],
+        notes=[*notes, *matched],
     )
 
 
@@ -67,33 +73,44 @@ def _open(path: Path, points: PointFiles, known: TextFormat | None) -> TextTable
     return TextTable.open(read_lines(path), columns=columns, given=(points.separator, points.decimal), known=known)
 
 
-def _read(
-    path: Path, points: PointFiles, first: TextTable, wanted: list[Column], number: int
-) -> Float[np.ndarray, "n c"]:
-    """Return the wanted columns of one file; a heading must be that of the first file."""
-    table = first if number == 0 else _open(path, points, first.sample.format)
+def _open_alike(path: Path, points: PointFiles, first: TextTable) -> TextTable:
+    """Return a further file; its heading must be that of the first."""
+    table = _open(path, points, first.sample.format)
     by_comment = table.sample.commented and first.sample.commented
     if table.sample.names != first.sample.names and not by_comment:
         raise RecordingError(
             f"{path} has the heading '{quoted(', '.join(table.sample.names)) or 'none'}', {first.text.path.name} has "
             f"'{quoted(', '.join(first.sample.names)) or 'none'}': the columns of all frames must be the same."
         )
-    return table.read(wanted)
+    return table
 
 
-def _position_columns(table: TextTable, points: PointFiles) -> tuple[list[Column], list[str]]:
+def _units(table: TextTable, columns: list[Column]) -> frozenset[str]:
+    """Return the units of length that the headings of columns, or the line below, state."""
+    sample = table.sample
+    numbers = column_numbers(sample, columns, str(table.text.path))
+    below = [f"x [{sample.units[number].strip('[]() ')}]" for number in numbers] if sample.units else []
+    return stated_units([*(sample.names[number] for number in numbers if sample.names), *below])
+
+
+def _position_columns(table: TextTable, points: PointFiles, keys: RowKeys) -> tuple[list[Column], list[str]]:
     """Return the columns of x, y and z, and notes where the heading decided it."""
     if points.format is not None:
         return list(DIC_FORMATS[points.format].columns), []
     if points.columns is not None:
         return list(points.columns), []
+    columns = column_numbers(table.sample, None, str(table.text.path))
     plain = [plain_heading(name) for name in table.sample.names]
-    if all(plain.count(axis) == 1 for axis in AXES):
-        columns: list[Column] = [plain.index(axis) for axis in AXES]
-        return columns, [] if columns == [0, 1, 2] else [f"x, y and z are columns {columns}, by the heading"]
+    if plain and [plain[column] for column in columns] == list(AXES):
+        return [*columns], [] if columns == [0, 1, 2] else [f"x, y and z are columns {columns}, by the heading"]
     for name, known in DIC_FORMATS.items():
         if {plain_heading(column) for column in known.columns} <= set(plain):
             raise RecordingError(f'{table.text.path} has the headings of a DIC export: give format = "{name}".')
+    if keys.columns & {0, 1, 2}:
+        raise RecordingError(
+            f"{table.text.path} has the heading '{quoted(', '.join(table.sample.names))}', which names no x, y and z: "
+            "give columns in [points]."
+        )
     return [0, 1, 2], []
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ...errors import RecordingError
 from ..data_folder import quoted
-from .cells import parse_cell
+from .cells import is_number, parse_cell
 from .text_format import Sample, TextFormat, column_numbers, find_format, take_sample
 from .text_lines import TextLines
 
@@ -81,3 +81,13 @@ class TextTable:
                     f"'{fmt.decimal}'."
                 ) from failure
         return np.array(found).reshape(-1, len(numbers))
+
+    def names_of(self, column: int | str) -> list[str]:
+        """Return what a column names: numbers without regard to how they are written, and other text as it is.
+
+        The column must be one that `read` could split.
+        """
+        (number,) = column_numbers(self.sample, [column], str(self.text.path))
+        fmt = self.sample.format
+        cells = [fmt.split(content)[number] for _, content in self.text.lines[self.sample.first :]]
+        return [f"{parse_cell(cell, fmt.decimal):.17g}" if is_number(cell, fmt.decimal) else cell for cell in cells]

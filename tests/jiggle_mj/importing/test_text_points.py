@@ -51,7 +51,7 @@ def first_frame(tmp_path, content: str | bytes, keys: str = "") -> np.ndarray:
         table(" ").replace("0.125", "1.25D-1").replace("2.125", "0.2125d+01"),
         codecs.BOM_UTF8 + table(",").encode(),
         table(",").encode("utf-16"),
-        table(",", heading="x [µm],y,z").encode("cp1252"),
+        table(",", heading="Größe\nx,y,z").encode("cp1252"),
     ],
 )
 def test_one_table_in_many_forms_is_the_same_points(tmp_path, content):
