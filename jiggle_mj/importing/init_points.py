@@ -13,14 +13,13 @@ from .point_files import read_frames
 from .points.archives import array_shapes
 from .points.dic_formats import DIC_FORMATS
 from .points.points_table import PointFiles
+from .points.visibility import as_visibility, may_say_visibility
 from .units import LENGTH_UNITS, LIKELY_EXTENT, PREFERRED_UNITS
 
 ARCHIVES, FRAMES = (".npz", ".mat"), (".csv", ".txt", ".tsv", ".xyz", ".dat", ".ply", ".obj", ".pcd", ".asc", ".pts")
 """Endings of files that hold all frames, and of files that hold one each."""
 MAX_FILES = 20_000
 """Files of a folder that are looked at."""
-VISIBILITY = re.compile(r"visib|valid|occlu", re.IGNORECASE)
-"""Names of arrays that say which points are seen."""
 UNIT_SUFFIX = re.compile(r"_(um|mm|cm|m)$")
 """End of an array's name that states its unit of length."""
 
@@ -128,10 +127,9 @@ def _first_readable(folder: Path, files: PointFiles, failures: list[str]) -> Gue
     ways: list[tuple[PointFiles, str | None]] = [(files, None)]
     if files.key is None:
         ways += [(replace(files, format=name), None) for name in DIC_FORMATS]
-    visible = next((key for key in shapes if VISIBILITY.search(key)), None)
+    visible = [as_visibility(key) for key in shapes if key != files.key and may_say_visibility(key)]
     ways += [(replace(files, layout=("points", "frames", "xyz")), "points, frames")] if shapes else []
-    if visible is not None:
-        ways += [(replace(way, visibility=visible), layout) for way, layout in ways]
+    ways += [(replace(way, visibility=each), layout) for each in visible for way, layout in ways]
     for way, layout in ways:
         try:
             found = read_frames(DataFolder(path=folder), way)

@@ -1,6 +1,5 @@
 """Frames of tracked points in arrays: one file with all frames, or an .npy or .npz a frame."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +13,8 @@ from .headings import stated_units
 from .layouts import FRAMES_FIRST, frames_first
 from .measured import Measured
 from .missing_rule import AXES
-from .points_table import NONE, PointFiles
-from .unseen import VISIBILITY_NAME, read_visibility, split_negation
-
-HIDDEN_NAME = re.compile(r"occlu|lost|invis|invalid", re.IGNORECASE)
-"""Names of arrays that are true where a point is not seen."""
+from .points_table import PointFiles
+from .visibility import named_visibility, refuse_unnamed_visibility
 
 
 def read_array_frames(paths: list[Path], points: PointFiles) -> Measured:
@@ -39,25 +35,13 @@ def read_array_frames(paths: list[Path], points: PointFiles) -> Measured:
     n_times = None if times is None else times.size
     positions = frames_first(_components(path, points.key, points), points.layout, name=name, n_times=n_times)
     positions = np.asarray(positions, dtype=np.float64)
-    shape, shapes = positions.shape[:2], array_shapes(path)
+    shapes = array_shapes(path)
     used = {points.times, points.runs, *_keys(points.key), *_keys(points.displacements)}
     others = {key: given for key, given in shapes.items() if key not in used}
-    notes: list[str] = []
-    seen = None
     swapped = points.layout is not None and points.layout.index("points") < points.layout.index("frames")
+    seen, notes = named_visibility(path, points, (positions.shape[0], positions.shape[1]), swapped=swapped)
     if points.visibility is None and (points.missing is None or points.missing.column not in others):
-        _refuse_unused_visibility(path, points, others, shape)
-    elif points.visibility not in (None, NONE):
-        key, negated = split_negation(points.visibility)
-        seen, how = read_visibility(
-            read_array(path, key),
-            name=f"{path}: {key}",
-            shape=shape,
-            swapped=swapped,
-            threshold=points.visibility_threshold,
-        )
-        seen = ~seen if negated else seen
-        notes.append(f"{key}: {how}{', and taken as its opposite' if negated else ''}; {int((~seen).sum())} are unseen")
+        notes = refuse_unnamed_visibility(path, others, positions, swapped=swapped)
     return Measured(
         positions=positions,
         times=times,
@@ -70,29 +54,6 @@ def read_array_frames(paths: list[Path], points: PointFiles) -> Measured:
         names=[f"{path.name} frame {number}" for number in range(len(positions))],
         notes=notes,
     )
-
-
-def _refuse_unused_visibility(
-    path: Path, points: PointFiles, shapes: dict[str, tuple[int, ...]], shape: tuple[int, ...]
-) -> None:
-    """Refuse an archive with an array that seems to say which points are seen, and marks some as unseen.
-
-    Raises:
-        RecordingError: an array of truth values, or with such a name, has one value for each frame and point,
-            and not all mean seen.
-    """
-    wanted = tuple(length for length in shape if length != 1)
-    for key, given in shapes.items():
-        sizes = tuple(length for length in given if length != 1)
-        if sizes not in (wanted, wanted[::-1]) or len(sizes) < 2:
-            continue
-        negated, values = HIDDEN_NAME.search(key) is not None, read_array(path, key)
-        unseen = (values >= points.visibility_threshold) if negated else (values < points.visibility_threshold)
-        if (values.dtype.kind == "b" or VISIBILITY_NAME.search(key)) and unseen.any():
-            raise RecordingError(
-                f"{path} has an array {quoted(key)} {given}, which seems to say which points are seen, and not all are"
-                f': give visibility = "{"not " * negated}{quoted(key)}" in [points], or visibility = "none".'
-            )
 
 
 def _keys(given: str | tuple[int | str, ...] | None) -> tuple[int | str, ...]:

@@ -44,6 +44,10 @@ class TextFormat:
             return line.split()
         return [cell.strip() for cell in line.split(self.separator)]
 
+    def readable(self, cell: str) -> bool:
+        """Return whether a cell holds a number, or a word for none."""
+        return is_number(cell, self.decimal) or is_unseen(cell)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
@@ -152,7 +156,7 @@ def _valid(text: TextLines, fmt: TextFormat, columns: Sequence[int | str] | None
     width = len(sample.rows[0])
     if any(len(row) != width for row in sample.rows) or width < max(MIN_COLUMNS, *(each + 1 for each in needed)):
         return None
-    readable = all(_readable(row[column], fmt) for row in sample.rows for column in needed)
+    readable = all(fmt.readable(row[column]) for row in sample.rows for column in needed)
     return sample if readable else None
 
 
@@ -193,10 +197,6 @@ def column_numbers(sample: Sample, columns: Sequence[int | str] | None, where: s
 
 def _is_row(cells: list[str], fmt: TextFormat) -> bool:
     return any(is_number(cell, fmt.decimal) for cell in cells) or all(is_unseen(cell) for cell in cells)
-
-
-def _readable(cell: str, fmt: TextFormat) -> bool:
-    return is_number(cell, fmt.decimal) or is_unseen(cell)
 
 
 def _is_numbering(cells: list[str], rest: list[list[str]]) -> bool:

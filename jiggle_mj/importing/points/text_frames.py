@@ -12,12 +12,13 @@ from .file_kinds import refuse_many
 from .headings import plain_heading, stated_units
 from .measured import Measured
 from .missing_rule import AXES, MissingRule
-from .points_table import PointFiles
+from .points_table import NONE, PointFiles
 from .row_keys import Column, RowKeys
 from .text_format import TextFormat, column_numbers
 from .text_lines import read_lines
 from .text_table import TextTable
 from .tracks import FrameRows, joined_tracks
+from .visibility import HIDDEN_NAME, may_say_visibility, refuse_low_ratings
 
 
 def read_text_frames(paths: list[Path], points: PointFiles) -> Measured:
@@ -35,17 +36,30 @@ def read_text_frames(paths: list[Path], points: PointFiles) -> Measured:
     rule = missing_rule(points)
     rule_column = _rule_column(first, rule, columns, by_format=points.missing is None)
     wanted = [*columns, *displacements, *([] if rule_column is None else [rule_column])]
+    ratings = [] if points.missing is not None or points.format is not None else _rating_columns(first, keys, wanted)
     refuse_many(len(paths), len(first.text.lines) - first.sample.first)
     frames: list[FrameRows] = []
     for number, path in enumerate(paths):
         table = first if number == 0 else _open_alike(path, points, first)
-        frames += keys.frames(table, keys.rows(table, wanted), alone=len(paths) == 1)
+        frames += keys.frames(table, keys.rows(table, [*wanted, *ratings]), alone=len(paths) == 1)
     if len(frames) == 1:
         notes.append("one text file is one frame; where it holds several, give frame_column in [points]")
     values, matched = joined_tracks(frames, keys.track_name)
     n = len(columns)
     if points.columns is None and points.format is None:
         _refuse_row_numbers(values[0, :, 0], first)
+    finite = np.asarray(np.isfinite(values[:, :, :n]).all(axis=2))
+    for number, column in enumerate(ratings, start=len(wanted)):
+        name = first.sample.names[column]
+        rule = f"{name} {'>=' if HIDDEN_NAME.search(name) else '<'} 0.5"
+        refuse_low_ratings(
+            values[:, :, number],
+            finite,
+            key=name,
+            where=f"{first.text.path} has a column '{quoted(name)}'",
+            cure=f'missing = "{quoted(rule)}" in [points], or missing = "{NONE}"',
+            none="missing",
+        )
     return Measured(
         positions=values[:, :, :n],
         times=keys.split_times(frames),
@@ -112,6 +126,15 @@ def _position_columns(table: TextTable, points: PointFiles, keys: RowKeys) -> tu
             "give columns in [points]."
         )
     return [0, 1, 2], []
+
+
+def _rating_columns(table: TextTable, keys: RowKeys, used: list[Column]) -> list[int]:
+    """Return the columns of numbers whose headings may say which points are seen, and which nothing uses."""
+    sample = table.sample
+    taken = {*keys.columns, *column_numbers(sample, used, str(table.text.path))}
+    likely = [number for number, name in enumerate(sample.names) if number not in taken and may_say_visibility(name)]
+    readable = sample.format.readable
+    return [number for number in likely if all(readable(row[number]) for row in sample.rows if len(row) > number)]
 
 
 def _displacement_columns(table: TextTable, points: PointFiles) -> list[Column]:

@@ -1,70 +1,19 @@
-"""Which tracked points are unseen: by a visibility array, by the rule `missing`, and marks that nobody declared."""
+"""Coordinates that stand for a lost point though nobody says so."""
 
-import re
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int
 
 from ...errors import RecordingError
 from ..data_folder import quoted
 
-VISIBILITY_NAME = re.compile(r"vis|occlu|valid|lost|mask|status|conf|score|prob", re.IGNORECASE)
-"""Names that trackers give to arrays of which points are seen."""
-NEGATED = re.compile(r"not\s+(.+)")
-"""A visibility that is the opposite of an array."""
 MARK_VALUES = (0.0, 1.0, -1.0, -9.0, -99.0, -999.0, -9999.0, -99999.0, 999.0, 9999.0, 99999.0)
 """Coordinates that programs write for a point without any."""
 MAX_COORDINATE = 1e9
 """Size above which a coordinate is a mark, whatever the unit: a thousand kilometres in mm."""
 MAX_LISTED_ROWS = 5
 """How many rows an error lists."""
-
-
-def read_visibility(
-    array: Shaped[np.ndarray, "..."], *, name: str, shape: tuple[int, int], swapped: bool, threshold: float
-) -> tuple[Bool[np.ndarray, "t n"], str]:
-    """Return which points are seen, and in words how that was read.
-
-    Args:
-        array: True, 1 or a probability where a point is seen; shape (frames, points) or (points, frames), with a batch
-            of one before and an axis of length 1 behind allowed.
-        name: file and array, for errors.
-        shape: number of frames and of points.
-        swapped: whether the positions have their points first; decides where both orders fit.
-        threshold: probability from which a point is seen.
-
-    Raises:
-        RecordingError: the array has another shape, or holds neither truth values nor probabilities.
-    """
-    flat = array
-    while flat.ndim > 2 and 1 in (flat.shape[0], flat.shape[-1]):
-        flat = flat[..., 0] if flat.shape[-1] == 1 else flat[0]
-    fits = {flat.shape == shape: flat, flat.shape == shape[::-1]: flat.T}
-    if flat.ndim != 2 or True not in fits:
-        raise RecordingError(
-            f"{name} has shape {array.shape}; visibility needs one value for each of {shape[0]} frames and {shape[1]} "
-            "points."
-        )
-    values = flat.T if swapped and flat.shape == shape[::-1] else fits[True] if shape[0] != shape[1] else flat
-    values = np.asarray(values)
-    if values.dtype.kind == "b":
-        return values, "true is seen"
-    values = np.nan_to_num(values, nan=0.0) if values.dtype.kind == "f" else values
-    if not ((values >= 0) & (values <= 1)).all():
-        raise RecordingError(
-            f"{name} holds values from {values.min():.3g} to {values.max():.3g}; visibility is true or "
-            'false, or a probability; for other values give missing = "ARRAY < NUMBER".'
-        )
-    if set(np.unique(values)) <= {0, 1}:
-        return values == 1, "1 is seen"
-    return values >= threshold, f"a probability of {threshold:g} or more is seen"
-
-
-def split_negation(name: str) -> tuple[str, bool]:
-    """Return the array that a visibility names, and whether it says which points are not seen."""
-    negated = NEGATED.fullmatch(name)
-    return (negated[1], True) if negated else (name, False)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -60,6 +60,15 @@ def test_an_archive_with_units_a_tool_and_triangles_is_described(tmp_path):
     assert description.problem is None
 
 
+def test_an_array_of_lost_points_is_taken_as_its_opposite(tmp_path):
+    outlier = np.zeros((12, 64), np.uint8)
+    outlier[3:5, 40] = 1
+    np.savez(tmp_path / "d.npz", p=frames(), outlier=outlier)
+    description = describe_folder(tmp_path)
+    assert description.problem is None and 'visibility = "not outlier"' in description.text
+    assert import_folder(tmp_path, None, tmp_path / "run.mcap").n_unseen == 2
+
+
 def test_the_sample_is_what_init_writes_but_for_gravity_and_bed(tmp_path):
     for name in ("tracks.npz", "attached.txt"):
         shutil.copy(SAMPLE / name, tmp_path / name)

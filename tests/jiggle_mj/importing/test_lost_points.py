@@ -105,6 +105,62 @@ def test_a_visibility_that_nobody_names_is_refused(tmp_path):
         read(archive(tmp_path, 'key = "p"', occluded=lost()))
 
 
+PERCENT = np.where(lost(), 20.0, 95.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "cure"),
+    [
+        ("quality", np.where(lost(), 0.1, 0.9), 'visibility = "quality"'),
+        ("quality", PERCENT, 'values from 20 to 95, .*missing = "quality < NUMBER"'),
+        ("confidence", PERCENT.T, 'missing = "confidence < NUMBER"'),
+        ("score", np.where(lost(), np.nan, 0.9), 'visibility = "score"'),
+        ("bad", lost().astype(np.uint8), 'visibility = "not bad"'),
+        ("is_outlier", lost().astype(float), 'visibility = "not is_outlier"'),
+        ("missing_flag", lost(), 'visibility = "not missing_flag"'),
+        ("not_occluded", ~lost(), 'visibility = "not_occluded"'),
+    ],
+)
+def test_a_rating_that_nobody_names_is_refused_and_its_cure_works(tmp_path, name, values, cure):
+    (tmp_path / "asked").mkdir()
+    with pytest.raises(RecordingError, match=cure):
+        read(archive(tmp_path / "asked", 'key = "p"', **{name: values}))
+    key = cure.rpartition("*")[2].replace("NUMBER", "50")
+    same(read(archive(tmp_path, f'key = "p"\n{key}', **{name: values})), lost())
+
+
+@pytest.mark.parametrize(
+    ("heading", "values", "rule"),
+    [
+        ("visible", ~lost(), "visible < 0.5"),
+        ("occluded", lost(), "occluded >= 0.5"),
+        ("likelihood", np.where(lost(), 0.3, 1.0), "likelihood < 0.5"),
+        ("quality", PERCENT, "quality < NUMBER"),
+    ],
+)
+def test_a_column_that_rates_the_points_is_refused_and_its_cure_works(tmp_path, heading, values, rule):
+    table = np.concatenate([sheet(), values[:, :, None]], axis=2)
+    (tmp_path / "asked").mkdir()
+    with pytest.raises(RecordingError, match=f"a column '{heading}'.* give missing = \"{rule}\""):
+        read(dic(tmp_path / "asked", f"x,y,z,{heading}", table, ""))
+    same(read(dic(tmp_path, f"x,y,z,{heading}", table, f'missing = "{rule.replace("NUMBER", "50")}"')), lost())
+
+
+def test_a_rating_that_tells_nothing_new_needs_no_key(tmp_path):
+    """Alike for all, or low where the points have no position anyway; one of another shape is named."""
+    values = np.where(lost()[:, :, None], np.nan, sheet())
+    where = archive(tmp_path, 'key = "p"', p=values, quality=np.full(SHAPE, 100.0), lost=lost(), score=np.zeros((3, 4)))
+    same(read(where), lost())
+    (where / "run.mcap").unlink()
+    (where / "run.truth.mcap").unlink()
+    assert bring_in(where)[0].notes == ("score (3, 4) has no value for each frame and point, and is not used",)
+
+
+def test_a_visibility_named_as_its_opposite_is_refused(tmp_path):
+    with pytest.raises(RecordingError, match='give visibility = "not occluded"'):
+        read(archive(tmp_path, 'key = "p"\nvisibility = "occluded"', occluded=lost()))
+
+
 def test_a_visibility_of_which_all_is_seen_needs_no_key(tmp_path):
     same(
         read(archive(tmp_path, 'key = "p"', visible=np.ones(SHAPE, bool), conf=np.full(SHAPE, 0.9))),
