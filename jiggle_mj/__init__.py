@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from .observation import Observation as Observation
     from .observation import StereoPair as StereoPair
     from .observation import ToolState as ToolState
-    from .plausibility.problems import RecordingProblem as RecordingProblem
+    from .plausibility.problem import RecordingProblem as RecordingProblem
     from .plausibility.problems import problems as problems
     from .plausibility.survey import Survey as Survey
     from .plausibility.survey import survey as survey
@@ -149,7 +149,8 @@ _NAMES_OF_MODULE = {
     "importing.folder": ("import_folder",),
     "material": ("Material",),
     "observation": ("Declaration", "DeclaredMesh", "MeasuredPoints", "Observation", "StereoPair", "ToolState"),
-    "plausibility.problems": ("RecordingProblem", "problems"),
+    "plausibility.problem": ("RecordingProblem",),
+    "plausibility.problems": ("problems",),
     "plausibility.survey": ("Survey", "survey"),
     "recording.reader": ("Recording",),
     "recording.writer": ("RecordingWriter",),

@@ -7,7 +7,8 @@ from typing import Any
 from rich.table import Table
 
 from ..errors import RecordingError
-from ..plausibility.problems import metres, problems, seconds
+from ..plausibility.problem import metres, seconds
+from ..plausibility.problems import problems
 from ..plausibility.survey import Survey, survey
 from ..recording.mcap_files import truth_path
 from ..recording.reader import Recording

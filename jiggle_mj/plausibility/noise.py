@@ -60,10 +60,10 @@ class NeighbourNoise:
         self._inflation = np.sqrt(2 * (1 + np.sum(self._weights**2, axis=1)))
 
     def add(self, positions: Float[np.ndarray, "n 3"]) -> None:
-        """Take one more frame of the same points [m]."""
+        """Take one more frame of the same points [m]; rows behind them, of points that came later, are left out."""
         if not len(self._centres):
             return
-        displacement = positions - self._rest
+        displacement = positions[: len(self._rest)] - self._rest
         predicted = np.einsum("mk,mkc->mc", self._weights, displacement[self._neighbours])
         residual = (displacement[self._centres] - predicted) / self._inflation[:, None]
         residual = residual[np.isfinite(residual).all(axis=1)]

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from ..observation import MeasuredPoints, ToolState
+from .identity import PointIdentity
 from .noise import NeighbourNoise, noise_of_difference
 
 MOST_MOVED = 95
@@ -26,6 +27,8 @@ class PointMotion:
         self._held: Int[np.ndarray, " m"] = np.zeros(0, np.int64)
         self._still_sds: list[float] = []
         self._neighbours: NeighbourNoise | None = None
+        self.identity: PointIdentity | None = None
+        """Rows that change places, and places of lost points; None before any frame."""
         self.rest: Float[np.ndarray, "n 3"] | None = None
         """First position of each point [m], NaN before it is seen."""
         self.largest = 0.0
@@ -70,6 +73,8 @@ class PointMotion:
             self._last_still = positions
         elif compare and self._neighbours is not None:
             self._neighbours.add(positions)
+        assert self.identity is not None
+        self.identity.add(positions)
         if not tool.closed or self._closing is None:
             return np.full(3, np.nan)
         moved = positions[self._held] - self._closing[self._held]
@@ -97,22 +102,32 @@ class PointMotion:
         return nearest_distance(positions, tool.position)
 
     def _by_track(self, points: MeasuredPoints) -> Float[np.ndarray, "n 3"]:
-        """Return positions by track, NaN where unseen; a track that is new gets its first position here."""
+        """Return positions by track, NaN where unseen, in the order in which tracks appear over the frames."""
         assert points.track_id is not None
         if self.rest is None:
-            self._ids, self.rest = points.track_id, points.positions.copy()
-            self._neighbours = NeighbourNoise(self.rest)
-            return points.positions
-        if np.array_equal(points.track_id, self._ids):
-            positions = points.positions
-        else:
-            row = {int(track): i for i, track in enumerate(points.track_id)}
-            where = np.array([row.get(int(track), -1) for track in self._ids])
-            padded = np.concatenate([points.positions, np.full((1, 3), np.nan)])
-            positions = padded[where]
+            self.rest = np.empty((0, 3))
+        new = np.setdiff1d(points.track_id[points.track_id >= 0], self._ids)
+        if len(new):
+            self._ids = np.concatenate([self._ids, new])
+            self.rest, self._last_still, self._closing = (
+                None if known is None else _with_rows(known, len(self._ids))
+                for known in (self.rest, self._last_still, self._closing)
+            )
+        assert self.rest is not None
+        order = np.argsort(points.track_id, kind="stable")
+        place = np.minimum(np.searchsorted(points.track_id[order], self._ids), len(order) - 1)
+        rows = order[place]
+        positions = np.where((points.track_id[rows] == self._ids)[:, np.newaxis], points.positions[rows], np.nan)
         first = np.isnan(self.rest[:, 0])
         self.rest[first] = positions[first]
+        if self._neighbours is None or self.identity is None:
+            self._neighbours, self.identity = NeighbourNoise(self.rest), PointIdentity(self.rest, spacing(self.rest))
         return positions
+
+
+def _with_rows(positions: Float[np.ndarray, "m 3"], count: int) -> Float[np.ndarray, "n 3"]:
+    """Return positions with as many rows, NaN in the added ones."""
+    return np.concatenate([positions, np.full((count - len(positions), 3), np.nan)])
 
 
 def nearest_distance(positions: Float[np.ndarray, "n 3"], place: Float[np.ndarray, " 3"]) -> float:

@@ -5,9 +5,9 @@ without a word. docs/RECORDINGS.md has them as a table.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from ..camera import MAX_BASELINE_M
+from .problem import RecordingProblem, metres, seconds
 from .survey import Survey
 
 REFUSED_EXTENT_M, DOUBTED_EXTENT_M = (1e-3, 10.0), (5e-3, 2.0)
@@ -43,21 +43,10 @@ MAX_UNSEEN = 0.5
 """Share of unseen points that is doubted."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecordingProblem:
-    """One thing about a recording that is wrong or doubtful."""
-
-    name: str
-    """Its name, in a few words with hyphens."""
-    refuses: bool
-    """Whether an estimate would be meaningless."""
-    text: str
-    """What was found, what is usual, and what to do; one sentence or two."""
-
-
 def problems(survey: Survey) -> tuple[RecordingProblem, ...]:
     """Return all problems of a surveyed recording, those that refuse it first."""
     found = [*_use(survey), *_size(survey), *_times(survey), *_camera(survey), *_tool(survey), *_noise(survey)]
+    found += survey.point_doubts
     return tuple(sorted(found, key=lambda problem: not problem.refuses))
 
 
@@ -258,19 +247,3 @@ def _refuse(name: str, text: str) -> RecordingProblem:
 
 def _warn(name: str, text: str) -> RecordingProblem:
     return _problem(name, text, refuses=False)
-
-
-def metres(length: float) -> str:
-    """Return a length in the unit in which it is easiest to read."""
-    for factor, unit in ((1.0, "m"), (1e3, "mm")):
-        if length * factor >= 1:
-            return f"{length * factor:.3g} {unit}"
-    return f"{length * 1e6:.3g} um" if length else "0 m"
-
-
-def seconds(time: float) -> str:
-    """Return a time in the unit in which it is easiest to read."""
-    for size, unit in ((3.156e7, "years"), (86400.0, "days"), (1.0, "s"), (1e-3, "ms"), (1e-6, "us")):
-        if time >= size:
-            return f"{time / size:.3g} {unit}"
-    return f"{time:.3g} s"

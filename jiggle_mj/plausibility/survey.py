@@ -13,7 +13,10 @@ from scipy.spatial.transform import Rotation
 from ..camera import StereoCamera
 from ..observation import Observation, ToolState
 from ..recording.reader import Recording
+from .increments import SummedMotion
 from .point_motion import PointMotion, common, extent, nearest_distance, spacing
+from .point_problems import point_problems
+from .problem import RecordingProblem
 
 COMPARED_FRAMES = 40
 """Most frames in which points are compared with their neighbours, evenly over the recording, which bounds the time."""
@@ -53,6 +56,8 @@ class Survey:
     """Largest mean displacement of the held points since the jaws closed [m]."""
     missing_tracks: tuple[int, ...]
     """Held tracks that no point has."""
+    point_doubts: tuple[RecordingProblem, ...]
+    """What is doubtful about which point is which, and about what their displacements are counted from."""
     grasps: int
     """Number of grasps with closed jaws."""
     closed_frames: int
@@ -154,6 +159,7 @@ def survey(recording: Recording) -> Survey:
         recording: an open recording; iterating it anew afterwards begins at its first frame.
     """
     motion, closed, times = PointMotion(), _Closed(), list[int]()
+    summed = SummedMotion()
     stride = max(1, len(recording) // COMPARED_FRAMES)
     first_cloud: Float[np.ndarray, "m 3"] | None = None
     declared_sd: float | None = None
@@ -175,6 +181,7 @@ def survey(recording: Recording) -> Survey:
                 held = motion.add(points, observation.tool, still=still, compare=compare)
             first_cloud = points.positions if first_cloud is None else first_cloud
         closed.add(observation, held, motion.held_at_closing)
+        summed.add(observation.tool, held)
     rest = motion.rest if motion.rest is not None else first_cloud
     if motion.still_sd is not None:
         noise_sd, noise_from = motion.still_sd, "still frames"
@@ -200,6 +207,7 @@ def survey(recording: Recording) -> Survey:
         points_motion_m=motion.largest if motion.n_expected else None,
         held_motion_m=closed.held,
         missing_tracks=motion.missing_tracks,
+        point_doubts=tuple(point_problems(motion.identity, summed)),
         grasps=len(closed.grasps),
         closed_frames=closed.frames,
         tool_by_points=closed.by_points,

@@ -1,0 +1,76 @@
+"""What is wrong with measured points that are no sheet's: lost ones, mixed up rows, displacements from frame to frame.
+
+docs/RECORDINGS.md has the names as a table.
+"""
+
+from collections.abc import Iterator
+
+from .identity import ISOLATED, Place, PointIdentity
+from .increments import SummedMotion
+from .problem import RecordingProblem
+
+MOST = 0.5
+"""Share of a frame's points that change places from which rows are in another order; fewer are a tracker's mistakes."""
+
+
+def point_problems(identity: PointIdentity | None, summed: SummedMotion) -> Iterator[RecordingProblem]:
+    """Find points that lose their identity, and displacements that are not those from rest.
+
+    Args:
+        identity: of the points with identities; None without any.
+        summed: motion of tool and held points.
+    """
+    if identity is not None:
+        yield from _lost(identity)
+        yield from _exchanged(identity)
+    if summed.follows:
+        yield RecordingProblem(
+            name="increments",
+            refuses=True,
+            text="the held points do not follow the tool, and the sum of their displacements over the frames does: "
+            "displacements must be those from the rest frame, not from the frame before; sum them up, or export them "
+            "relative to the reference.",
+        )
+
+
+def _lost(identity: PointIdentity) -> Iterator[RecordingProblem]:
+    """Find places that stand for lost points."""
+    cure = "give it as missing = [x, y, z] in recording.toml, in the unit of the file, or write NaN"
+    if identity.shared_place is not None:
+        place, count = identity.shared_place
+        yield RecordingProblem(
+            name="lost-mark",
+            refuses=True,
+            text=f"{count} points jump to exactly {_named(place)} m at some time, and their neighbours do not: that "
+            f"place stands for a lost point; {cure}.",
+        )
+    if len(identity.isolated):
+        x, y, z = identity.isolated[0].tolist()
+        yield RecordingProblem(
+            name="isolated",
+            refuses=False,
+            text=f"{len(identity.isolated)} points lie more than {ISOLATED:g} spacings from any other at rest, the "
+            f"first at {_named((x, y, z))} m: where that place stands for a lost point, {cure}; else leave it out.",
+        )
+
+
+def _exchanged(identity: PointIdentity) -> Iterator[RecordingProblem]:
+    """Find rows that are other points in other frames."""
+    share, count, frames = identity.largest_exchange, identity.n_exchanged, identity.exchange_frames
+    if not count:
+        return
+    cause = (
+        "are the rows sorted in each frame, or points found anew"
+        if share > MOST
+        else "does the tracker mix up points, or is an export sorted"
+    )
+    yield RecordingProblem(
+        name="identities",
+        refuses=share > MOST,
+        text=f"{count} points take places of others, up to {share:.0%} of a frame's points, in {frames} frames; "
+        f"{cause}? A row, or a track_id, must be the same point in every frame.",
+    )
+
+
+def _named(place: Place) -> str:
+    return f"({', '.join(f'{value:.6g}' for value in place)})"

@@ -1,0 +1,156 @@
+"""Points that are other points, or none, in some frames are found by name; noise, drift and unseen points are not."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from jiggle_mj.observation import IDENTITY_WXYZ, Declaration, MeasuredPoints, Observation, ToolState
+from jiggle_mj.plausibility.problems import problems
+from jiggle_mj.plausibility.survey import survey
+from jiggle_mj.recording.reader import Recording
+from jiggle_mj.recording.writer import RecordingWriter
+
+SPACING, LIFT = 5e-3, 20e-3
+"""Distance of the points at rest, and height of the lift [m]."""
+SD = 2e-4
+"""Noise of a coordinate [m]."""
+REST = np.array([(SPACING * column, SPACING * row, 0.0) for row in range(10) for column in range(12)])
+"""Points of the sheet at rest [m]."""
+HELD = (0, 1, 12, 13)
+N_STILL, N_CLOSED = 4, 10
+HEIGHT = LIFT * np.maximum(np.arange(-N_STILL, N_CLOSED), 0) / (N_CLOSED - 1)
+"""Height of the tool in each frame [m]."""
+PLACE = np.array([21e-3, 18e-3, 1e-3])
+"""A place inside the sheet, where no point is at rest [m]."""
+
+Edit = Callable[[np.ndarray], np.ndarray]
+
+
+def lifted(sd: float = SD) -> np.ndarray:
+    """Return a lift of a corner, shape (frames, points, 3) [m]."""
+    decay = np.exp(-np.linalg.norm(REST - REST[list(HELD)].mean(axis=0), axis=1) / 0.015)
+    up = HEIGHT[:, None, None] * decay[:, None] * np.array([0, 0, 1.0])
+    return REST + up + np.random.default_rng(3).normal(scale=sd, size=up.shape)
+
+
+def found(tmp_path, positions: np.ndarray, *, tracks: list[np.ndarray] | None = None, sd: float = SD):
+    """Return the survey and the names of what refuses and what is doubted, but that there is one grasp."""
+    tip = REST[list(HELD)].mean(axis=0)
+    with RecordingWriter(
+        tmp_path / "run.mcap", camera=None, declaration=Declaration(), metadata={}, overwrite=True
+    ) as writer:
+        for k, points in enumerate(positions):
+            rows = np.arange(len(REST)) if tracks is None else tracks[k]
+            closed = k >= N_STILL
+            writer.write(
+                Observation(
+                    index=k,
+                    time=k * 200_000_000,
+                    tool=ToolState(
+                        position=tip + HEIGHT[k] * np.array([0, 0, 1.0]),
+                        quat_wxyz=IDENTITY_WXYZ,
+                        closed=closed,
+                        grasp=int(closed),
+                        radius=2e-3,
+                        held_tracks=HELD if closed else (),
+                    ),
+                    points=MeasuredPoints(positions=points[rows], track_id=rows, sd=sd),
+                )
+            )
+    surveyed = survey(Recording.open(tmp_path / "run.mcap"))
+    listed = [each for each in problems(surveyed) if each.name != "one-grasp"]
+    return surveyed, {each.name for each in listed if each.refuses}, {each.name for each in listed if not each.refuses}
+
+
+def changed(edit: Callable[[np.ndarray], None]) -> np.ndarray:
+    positions = lifted()
+    edit(positions)
+    return positions
+
+
+def exchange(positions: np.ndarray) -> None:
+    positions[8:, [70, 71]] = positions[8:, [71, 70]]
+
+
+def lose_one_a_frame(positions: np.ndarray) -> None:
+    for k in range(1, len(positions)):
+        positions[k, 7 * k % len(REST)] = PLACE
+
+
+def never_find(positions: np.ndarray) -> None:
+    positions[:, 70] = -1.0
+
+
+def in_order_of_x(positions: np.ndarray) -> None:
+    for frame in positions:
+        frame[:] = frame[np.argsort(frame[:, 0])]
+
+
+def each_from_the_last(positions: np.ndarray) -> None:
+    positions[1:] = positions[0] + np.diff(positions, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("edit", "refused", "doubted"),
+    [
+        (exchange, set(), {"identities"}),
+        (lose_one_a_frame, {"lost-mark"}, set()),
+        (never_find, set(), {"isolated"}),
+    ],
+)
+def test_a_point_that_is_another_or_none_is_named(tmp_path, edit, refused, doubted):
+    assert found(tmp_path, changed(edit))[1:] == (refused, doubted)
+
+
+@pytest.mark.parametrize(("edit", "name"), [(in_order_of_x, "identities"), (each_from_the_last, "increments")])
+def test_points_of_which_most_are_wrong_are_refused(tmp_path, edit, name):
+    assert name in found(tmp_path, changed(edit))[1]
+
+
+def test_an_exchange_is_counted(tmp_path):
+    """Two of 120 points take each other's place in one step."""
+    (text,) = [each.text for each in found(tmp_path, changed(exchange))[0].point_doubts]
+    assert text.startswith("2 points take places of others, up to 2% of a frame's points, in 1 frames")
+
+
+def unseen(positions: np.ndarray) -> None:
+    positions[np.random.default_rng(5).random(positions.shape[:2]) < 0.4] = np.nan
+
+
+def drift(positions: np.ndarray) -> None:
+    rates = np.random.default_rng(5).normal(scale=2e-3, size=REST.shape)
+    positions += np.linspace(0, 1, len(positions))[:, None, None] * rates
+
+
+def move_by_a_spacing(positions: np.ndarray) -> None:
+    positions += SPACING * np.arange(len(positions))[:, None, None] * np.array([1.0, 0, 0])
+
+
+@pytest.mark.parametrize("edit", [unseen, drift, move_by_a_spacing])
+def test_points_that_are_the_same_are_not_doubted(tmp_path, edit):
+    """Also where every point comes to the very place of its neighbour, as all do."""
+    assert found(tmp_path, changed(edit))[0].point_doubts == ()
+
+
+def test_noise_of_a_fifth_of_the_spacing_is_no_exchange(tmp_path):
+    assert found(tmp_path, lifted(sd=1e-3), sd=1e-3)[1:] == (set(), set())
+
+
+def test_points_that_slip_are_no_increments(tmp_path):
+    """They follow the tool by three steps, then stay."""
+    positions = lifted()
+    positions[N_STILL + 4 :] = positions[N_STILL + 3]
+    assert "increments" not in found(tmp_path, positions)[1]
+
+
+def test_points_that_come_later_count(tmp_path):
+    """Half the tracks begin in frame 2; then all are seen, and their motion is in the numbers."""
+    rows = np.arange(len(REST))
+    tracks = [rows[60:] if k < 2 else rows for k in range(N_STILL + N_CLOSED)]
+    whole = found(tmp_path, lifted())[0]
+    surveyed, refused, doubted = found(tmp_path, lifted(), tracks=tracks)
+    assert (refused, doubted) == (set(), set())
+    assert surveyed.points == len(REST) and surveyed.unseen == 0
+    assert surveyed.held_motion_m == whole.held_motion_m == pytest.approx(0.8 * LIFT, rel=0.05)
+    assert surveyed.points_motion_m == pytest.approx(whole.points_motion_m, rel=0.05)
