@@ -36,6 +36,11 @@ MIN_EXTENT, MAX_EXTENT = 2e-3, 2.0
 """Smallest and largest extent of a sheet [m]: outside it the unit is wrong, or this is no tissue or cloth."""
 MAX_NOISE_SHARE = 0.25
 """Largest noise, as a share of the sheet's extent: with more, points do not show the sheet's shape."""
+MAX_GROWTH = 10.0
+"""Largest spread of the points in any frame, over that at rest: no sheet stretches so far, and displacements begin at
+nothing."""
+SPREAD = (5, 95)
+"""Percentiles over the points between which they spread: single wild points do not count."""
 MIN_REST_POINTS = 3
 """Finite points that a rest frame needs: three span a plane."""
 
@@ -157,8 +162,20 @@ def _frames_in_world(
     names = [names[number] for number in order]
     if np.isfinite(frames[0]).all(axis=1).sum() < MIN_REST_POINTS:
         raise RecordingError(f"the rest frame {names[0]} has fewer than three finite points; choose another rest.")
+    _refuse_growth(frames)
     _refuse_extent(frames[0], given)
     return frames, names, [number - given.points.rest for number in order]
+
+
+def _refuse_growth(frames: Float[np.ndarray, "t n 3"]) -> None:
+    seen = frames[:, np.isfinite(frames[0]).all(axis=1)]
+    low, high = np.nanpercentile(seen[np.isfinite(seen).any(axis=(1, 2))], SPREAD, axis=1)
+    spread = (high - low).max(axis=1)
+    if spread.max() > MAX_GROWTH * spread[0]:
+        raise RecordingError(
+            f"the points spread over {spread[0]:.3g} m at rest and over {spread.max():.3g} m later: are these "
+            "displacements? Give the reference coordinates as points, and these as displacements in [points]."
+        )
 
 
 def _refuse_extent(rest: Float[np.ndarray, "n 3"], given: MeasuredRecording) -> None:

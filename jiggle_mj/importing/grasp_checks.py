@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import RecordingError
+from ..plausibility.increments import follow_in_sum
 from .clock import FrameClock
 from .grasps import GraspSpan
 from .recording_toml import MeasuredRecording
@@ -117,6 +118,11 @@ def _refuse_still(
     still = int((share < STILL_SHARE).sum())
     if not len(share) or still < STILL_REFUSED * len(share):
         return
+    if follow_in_sum(moved[:, grasp.held].mean(axis=1), leading):
+        raise RecordingError(
+            f"{grasp.what}: the held points do not follow {leader}, and the sum of their displacements over the frames "
+            "does: give displacements from the rest frame, not from the frame before."
+        )
     cure = (
         "give each pull its own [[grasp]] with its rows, or at and radius, and run, begin and end, or frames"
         if len(set(clock.runs)) > 1 or several

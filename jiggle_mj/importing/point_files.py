@@ -82,6 +82,7 @@ def _without_unseen(
     check.refuse_far(positions)
     if points.missing is None or points.missing.place is not None or points.missing.column is not None:
         check.refuse_marks(positions)
+        measured.notes.extend(check.doubted_rows(positions))
     return positions
 
 

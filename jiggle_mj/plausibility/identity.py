@@ -8,7 +8,7 @@ noise apart.
 from collections import defaultdict
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 N_NEIGHBOURS = 8
@@ -42,7 +42,7 @@ class PointIdentity:
             spacing: median distance of one to the nearest other [m]; None where it is unknown.
         """
         self._spacing = spacing or 0.0
-        self.isolated: Float[np.ndarray, "i 3"] = _isolated(rest, self._spacing)
+        self.isolated: Float[np.ndarray, "i 3"] = rest[isolated(rest, spacing)]
         """Points that are far from all others at rest [m]."""
         self._last: Float[np.ndarray, "n 3"] = np.empty((0, 3))
         self._visitors: defaultdict[Place, set[int]] = defaultdict(set)
@@ -115,13 +115,18 @@ class PointIdentity:
         return points
 
 
-def _isolated(rest: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, "i 3"]:
-    """Return the seen points that are far from all others [m]."""
-    seen = rest[np.isfinite(rest).all(axis=1)]
-    if len(seen) < 2 or not spacing:
-        return seen[:0]
-    distance = np.asarray(KDTree(seen).query(seen, k=2)[0])[:, 1]
-    return seen[distance > ISOLATED * spacing]
+def isolated(rest: Float[np.ndarray, "n 3"], spacing: float | None) -> Bool[np.ndarray, " n"]:
+    """Return which seen points are far from all others.
+
+    Args:
+        rest: points [m], NaN where unseen.
+        spacing: median distance of one to the nearest other [m]; None where it is unknown.
+    """
+    alone, seen = np.zeros(len(rest), bool), np.isfinite(rest).all(axis=1)
+    if spacing:
+        distance = np.asarray(KDTree(rest[seen]).query(rest[seen], k=2)[0])[:, 1]
+        alone[seen] = distance > ISOLATED * spacing
+    return alone
 
 
 def _place(position: Float[np.ndarray, " 3"]) -> Place:

@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...errors import RecordingError
+from ...plausibility.identity import SAME_PLACE_M, PointIdentity, isolated
+from ...plausibility.point_motion import spacing
 from ..data_folder import quoted
 
 MARK_VALUES = (0.0, 1.0, -1.0, -9.0, -99.0, -999.0, -9999.0, -99999.0, 999.0, 9999.0, 99999.0)
@@ -31,34 +33,63 @@ class MarkCheck:
         Raises:
             RecordingError: such a position is there; names frame, rows and place.
         """
-        far = (np.abs(np.nan_to_num(positions)) > MAX_COORDINATE).any(axis=2)
-        frames, points = np.nonzero(far)
-        if len(frames):
-            rows = points[frames == frames[0]]
-            self._refuse(int(frames[0]), positions[frames[0], rows[0]], rows, "too far away for a point")
+        far = np.asarray((np.abs(np.nan_to_num(positions)) > MAX_COORDINATE).any(axis=2))
+        self._refuse_where(positions, far, "too far away for a point")
 
     def refuse_marks(self, positions: Float[np.ndarray, "t n 3"]) -> None:
         """Refuse positions that cannot be those of points.
 
-        Two points cannot be at one place; a point that is at 0, 0, 0 or another usual mark in some frames alone has
-        not moved there.
+        Two points cannot be at one place, nor jump to one at different times. A point that is at 0, 0, 0 or another
+        usual mark in some frames alone has not moved there; one that is there in all of them, far from the sheet, was
+        never found.
 
         Raises:
             RecordingError: such a position is there; names frame, rows and place.
         """
         for number, frame in enumerate(positions):
             rows = _shared_place(frame)
+            if number == 0 and len(rows) == len(frame):
+                raise RecordingError(
+                    f"{self.names[0]} has all points at one place: are these displacements? Give the reference "
+                    "coordinates as points, and these as displacements in [points]."
+                )
             if len(rows):
                 self._refuse(number, frame[rows[0]], rows, "two points cannot be at one place")
         marked = np.asarray(np.all(np.isin(positions, MARK_VALUES), axis=2))
-        partly = marked & ~marked.all(axis=0)
+        always = marked.all(axis=0)
+        partly = marked & ~always
         jumped = partly & (_jump(positions) > _extent(positions))
-        zero = (positions == 0).all(axis=2)
+        zero = np.asarray((positions == 0).all(axis=2))
         at_origin = partly & zero & ~marked[0]
-        frames, points = np.nonzero(jumped | at_origin)
+        self._refuse_where(positions, np.asarray(jumped | at_origin), "it is elsewhere in other frames")
+        alone = always & isolated(positions[0], spacing(positions[0]))
+        self._refuse_where(positions, marked & alone, "it is there in every frame, far from all others")
+        identity = PointIdentity(positions[0], spacing(positions[0]))
+        for frame in positions:
+            identity.add(frame)
+        if identity.shared_place is not None:
+            place, count = identity.shared_place
+            there = np.asarray((np.abs(positions - place) <= SAME_PLACE_M).all(axis=2))
+            self._refuse_where(positions, there, f"{count} points jump to it at different times")
+
+    def doubted_rows(self, positions: Float[np.ndarray, "t n 3"]) -> list[str]:
+        """Return a line where rows are at a usual mark in every frame, while all others move."""
+        still = (positions == positions[0]).all(axis=(0, 2))
+        always = np.isin(positions[0], MARK_VALUES).all(axis=1) & still
+        if not always.any() or (still & ~always).any():
+            return []
+        x, y, z = positions[0, always][0].tolist()
+        return [
+            f"rows {np.flatnonzero(always)[:MAX_LISTED_ROWS].tolist()} from 0 are at exactly ({x:g}, {y:g}, {z:g}) in "
+            f"every frame, and no other point stands still: if they are lost, give missing = [{x:g}, {y:g}, {z:g}]"
+        ]
+
+    def _refuse_where(self, positions: Float[np.ndarray, "t n 3"], wrong: Bool[np.ndarray, "t n"], why: str) -> None:
+        """Refuse the wrong positions of the first frame that has any."""
+        frames, points = np.nonzero(wrong)
         if len(frames):
             rows = points[frames == frames[0]]
-            self._refuse(int(frames[0]), positions[frames[0], rows[0]], rows, "it is elsewhere in other frames")
+            self._refuse(int(frames[0]), positions[frames[0], rows[0]], rows, why)
 
     def _refuse(self, number: int, place: Float[np.ndarray, " 3"], rows: Int[np.ndarray, " r"], why: str) -> None:
         listed = ", ".join(str(row) for row in rows[:MAX_LISTED_ROWS]) + (

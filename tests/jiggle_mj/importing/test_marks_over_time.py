@@ -1,0 +1,80 @@
+"""Marks of lost points that one frame alone does not show, and displacements that are taken for positions."""
+
+import numpy as np
+import pytest
+
+from jiggle_mj.errors import RecordingError
+from tests.support.measured_folder import TOML, bring_in, folder
+
+FRAMES, HELD = 12, (0, 1, 8, 9)
+TOML_OF_ARRAY = TOML.replace('files = ["rest.xyz", "pulled_*.xyz"]', 'files = ["d.npz"]\nkey = "p"').replace(
+    "rows = [0, 1]", f"rows = {list(HELD)}"
+)
+
+
+def sheet() -> np.ndarray:
+    """Frames of an 8 x 6 sheet of 5 mm pitch around the origin, whose corner rises by 20 mm; noise of 0.05 mm [mm]."""
+    x, y = np.meshgrid(5.0 * np.arange(8) - 17.3, 5.0 * np.arange(6) - 12.4)
+    rest = np.column_stack([x.ravel(), y.ravel(), np.full(48, 0.3)])
+    decay = np.exp(-np.linalg.norm(rest - rest[0], axis=1) / 12)
+    up = np.linspace(0, 20, FRAMES)[:, None, None] * decay[:, None] * np.array([0, 0, 1.0])
+    return rest + up + np.random.default_rng(7).normal(scale=0.05, size=up.shape)
+
+
+def notes(tmp_path, positions: np.ndarray, keys: str = "", **arrays: np.ndarray) -> tuple[str, ...]:
+    """Import the positions; return the notes."""
+    where = folder(tmp_path, toml=TOML_OF_ARRAY.replace('key = "p"', f'key = "p"\n{keys}'))
+    np.savez(where / "d.npz", p=positions, **arrays)
+    return bring_in(where)[0].notes
+
+
+@pytest.mark.parametrize("mark", [(0, 0, 0), (-1, -1, -1), (3.25, -2, 0.5)])
+def test_one_lost_point_a_frame_at_a_place_inside_the_sheet_is_refused(tmp_path, mark):
+    positions = sheet()
+    for k in range(1, FRAMES):
+        positions[k, 5 * k % 48] = mark
+    with pytest.raises(RecordingError, match=r"frame \d+ has 1 point at exactly .*give missing = \["):
+        notes(tmp_path, positions)
+
+
+@pytest.mark.parametrize("mark", [0, -1, -999])
+def test_a_row_that_is_at_a_mark_far_from_the_sheet_in_every_frame_is_refused(tmp_path, mark):
+    positions = sheet() + 300
+    positions[:, 20] = mark
+    with pytest.raises(RecordingError, match=rf"rows 20 .*in every frame, far from all others.*missing = \[{mark}, "):
+        notes(tmp_path, positions)
+
+
+def test_a_row_that_is_at_a_mark_inside_the_sheet_in_every_frame_is_noted(tmp_path):
+    positions = sheet()
+    positions[:, 20] = 0
+    (note,) = notes(tmp_path, positions)
+    assert note.startswith("rows [20] from 0 are at exactly (0, 0, 0)") and "missing = [0, 0, 0]" in note
+
+
+def test_a_point_at_the_origin_among_others_that_stand_still_is_not_noted(tmp_path):
+    positions = sheet() - sheet()[0, 47]
+    positions[:, 40:] = positions[0, 40:]
+    assert notes(tmp_path, positions) == ()
+
+
+@pytest.mark.parametrize("first", [0.0, 1e-2])
+def test_displacements_without_coordinates_are_refused_as_such(tmp_path, first):
+    """They begin at nothing, or at noise."""
+    displacements = sheet() - sheet()[0]
+    displacements[0] = np.random.default_rng(1).normal(scale=first, size=(48, 3)) if first else 0
+    with pytest.raises(RecordingError, match=r"are these displacements\? Give the reference coordinates as points"):
+        notes(tmp_path, displacements)
+
+
+def test_displacements_from_frame_to_frame_are_refused_as_such(tmp_path):
+    """The tool rises by 20 mm in eleven steps; a held point by one step at most."""
+    positions, rise = sheet(), np.linspace(0, 20, FRAMES)
+    tool = positions[0, list(HELD)].mean(axis=0) + rise[:, None] * np.array([0, 0, 1.0])
+    positions[:, list(HELD)] = positions[0, list(HELD)] + (tool - tool[0])[:, None]
+    steps = np.diff(positions, axis=0, prepend=positions[:1])
+    toml = TOML_OF_ARRAY.replace("[grasp]", '[grasp]\ntool = "t"')
+    where = folder(tmp_path, toml=toml.replace('key = "p"', 'key = "p"\ndisplacements = "u"'))
+    np.savez(where / "d.npz", p=np.repeat(positions[:1], FRAMES, axis=0), u=steps, t=tool)
+    with pytest.raises(RecordingError, match="the sum of their displacements over the frames does"):
+        bring_in(where)
