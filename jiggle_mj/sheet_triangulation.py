@@ -11,13 +11,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from .errors import MeshError
+from .observation import MAX_PARTICLES
 
 MIN_OUTLINE_SHAPE = 0.25
 """Twice the area over the longest edge squared below which an outline triangle is dropped (equilateral: 0.87)."""
 CLEARANCE = 0.6
 """Distance to a measured point below which a lattice point is left out [spacings]."""
-MAX_ADDED = 20_000
-"""Vertices that a continuation may have: more than an estimate can use."""
 BORDER_CLEARANCE = 0.5
 """Distance to the outline below which a lattice point inside is left out [spacings]."""
 END_SHARE, END_SPACINGS = 0.1, 1.5
@@ -110,7 +109,7 @@ def extend(flat: Float[np.ndarray, "m 2"], *, begin: float, end: float, spacing:
         spacing: spacing of the lattice [m].
 
     Raises:
-        MeshError: either end would need more than `MAX_ADDED` vertices.
+        MeshError: either end would need more than `MAX_PARTICLES` vertices.
     """
     first, last = flat[:, 0].min(), flat[:, 0].max()
     zone = max(END_SHARE * (last - first), END_SPACINGS * spacing)
@@ -148,7 +147,7 @@ def fill_outline(
         clearance: distance to a measured point below which a vertex is left out [m].
 
     Raises:
-        MeshError: the polygon would need more than `MAX_ADDED` vertices.
+        MeshError: the polygon would need more than `MAX_PARTICLES` vertices.
     """
     low, high = outline.min(axis=0), outline.max(axis=0)
     pitch = np.array([spacing, spacing * np.sqrt(3) / 2])
@@ -162,24 +161,24 @@ def fill_outline(
             for begin, end in zip(outline, np.roll(outline, -1, axis=0), strict=True)
         ]
     )
-    inside = lattice[_within(lattice, outline)]
+    inside = lattice[within(lattice, outline)]
     inside = inside[KDTree(border).query(inside)[0] >= BORDER_CLEARANCE * spacing]
     added = np.concatenate([border, inside])
     return added[KDTree(flat).query(added)[0] >= clearance]
 
 
 def _refuse_many(length: float, width: float, spacing: float) -> None:
-    """Refuse a lattice of more than `MAX_ADDED` vertices, before it is made."""
+    """Refuse a lattice of more than `MAX_PARTICLES` vertices, before it is made."""
     rows, across = (float(np.ceil(each)) + 1 for each in (length / (spacing * 3**0.5 / 2), width / spacing))
     count = rows * across
-    if not count <= MAX_ADDED:
+    if not count <= MAX_PARTICLES:
         raise MeshError(
             f"a sheet of {width:.3g} x {length:.3g} m at a spacing of {spacing:.3g} m has about {count:.3g} vertices; "
-            f"at most {MAX_ADDED} are allowed: give a larger spacing."
+            f"at most {MAX_PARTICLES} are allowed: give a larger spacing."
         )
 
 
-def _within(points: Float[np.ndarray, "p 2"], outline: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, " p"]:
+def within(points: Float[np.ndarray, "p 2"], outline: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, " p"]:
     """Return which points lie within a polygon, by the even-odd rule."""
     inside = np.zeros(len(points), bool)
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):

@@ -11,11 +11,10 @@ from ..sheet_triangulation import CLEARANCE, SheetPlane, extend, fill_outline, t
 from .data_folder import DataFolder
 from .faces import read_faces
 from .recording_toml import Extension, Margin, MeasuredRecording
+from .sheet_outline import sheet_outline
 
 MAX_EDGE_SPACINGS = 2.5
 """Longest edge of a triangle that is not declared [spacings]: it bridges one missing row of points, but not two."""
-MIN_LEVEL = 0.5
-"""Cosine of the steepest slope at which [x, y] names a place on the sheet: 60 degrees."""
 
 
 def declared_mesh(
@@ -32,12 +31,12 @@ def declared_mesh(
     rows, faces = np.flatnonzero(np.isfinite(rest).all(axis=1)), None
     if given.faces is not None:
         rows, faces = _seen_faces(rest, read_faces(folder, given, rest, notes))
+        check_mesh(rest[rows], faces)
     if given.extension is not None:
         return _extended(rest, rows, faces, given.extension)
     if given.margin is not None:
         return _with_margin(rest, rows, faces, given.margin)
     assert faces is not None
-    check_mesh(rest[rows], faces)
     return DeclaredMesh(vertices=rest[rows], faces=faces, track_id=rows)
 
 
@@ -59,17 +58,13 @@ def _extended(
     extension: Extension,
 ) -> DeclaredMesh:
     """Return the measured points and their continuation, triangulated anew in the orientation of the measured faces."""
-    if faces is not None:
-        check_mesh(rest[rows], faces)
     plane = SheetPlane.through(rest[rows], extension.axis)
     flat = plane.flatten(rest[rows])
     begin, end = sorted((plane.along(extension.begin), plane.along(extension.end)))
     added = extend(flat, begin=begin, end=end, spacing=extension.spacing)
     vertices = np.concatenate([rest[rows], plane.raise_up(added)])
     spacing = max(extension.spacing, spacing_of(flat))
-    new_faces = triangulate(np.concatenate([flat, added]), MAX_EDGE_SPACINGS * spacing)
-    if faces is not None and _upward(plane, rest[rows], faces) < 0:
-        new_faces = new_faces[:, ::-1].copy()
+    new_faces = _triangulated(plane, np.concatenate([flat, added]), spacing, rest[rows], faces)
     held = None
     if extension.held_beyond is not None:
         held = plane.beyond(vertices, extension.held_beyond)
@@ -90,18 +85,14 @@ def _with_margin(
     margin: Margin,
 ) -> DeclaredMesh:
     """Return the measured points and the sheet around them, triangulated anew in the orientation of given faces."""
-    if faces is not None:
-        check_mesh(rest[rows], faces)
     plane = SheetPlane.through(rest[rows])
     flat = plane.flatten(rest[rows])
     spacing = spacing_of(flat) if margin.spacing is None else margin.spacing
-    outline = _outline(plane, flat, margin)
+    outline = sheet_outline(plane, flat, margin, spacing=spacing_of(flat))
     added = fill_outline(flat, outline=outline, spacing=spacing, clearance=CLEARANCE * max(spacing, spacing_of(flat)))
     if not len(added):
         raise RecordingError(f"[mesh] margin or outline adds no vertex at a spacing of {spacing:.3g} m; lower spacing.")
-    new_faces = triangulate(np.concatenate([flat, added]), MAX_EDGE_SPACINGS * max(spacing, spacing_of(flat)))
-    if faces is not None and _upward(plane, rest[rows], faces) < 0:
-        new_faces = new_faces[:, ::-1].copy()
+    new_faces = _triangulated(plane, np.concatenate([flat, added]), max(spacing, spacing_of(flat)), rest[rows], faces)
     vertices = np.concatenate([rest[rows], plane.raise_up(added)])
     track = np.concatenate([rows, np.full(len(added), -1)])
     used, renumbered = np.unique(new_faces, return_inverse=True)
@@ -110,25 +101,23 @@ def _with_margin(
     return DeclaredMesh(vertices=vertices[used], faces=new_faces, track_id=track[used])
 
 
-def _outline(plane: SheetPlane, flat: Float[np.ndarray, "m 2"], margin: Margin) -> Float[np.ndarray, "k 2"]:
-    """Return the sheet's corners in its plane [m]: those that are given, or a rectangle around the points."""
-    if margin.outline is None:
-        assert margin.width is not None
-        (left, low), (right, high) = flat.min(axis=0) - margin.width, flat.max(axis=0) + margin.width
-        return np.array([[left, low], [right, low], [right, high], [left, high]])
-    corners, above = margin.outline.copy(), plane.axes[2]
-    missing = np.isnan(corners[:, 2])
-    if missing.any():
-        if abs(above[2]) < MIN_LEVEL:
-            raise RecordingError("[mesh] outline needs corners [x, y, z]: the sheet stands too steep for [x, y].")
-        offset = (corners[:, :2] - plane.centre[:2]) @ above[:2]
-        corners[:, 2] = plane.centre[2] - offset / above[2]
-    return plane.flatten(corners)
-
-
 def spacing_of(flat: Float[np.ndarray, "m 2"]) -> float:
     """Return the median distance between nearest neighbours [m]."""
     return float(np.median(KDTree(flat).query(flat, k=2)[0][:, 1]))
+
+
+def _triangulated(
+    plane: SheetPlane,
+    flat: Float[np.ndarray, "v 2"],
+    spacing: float,
+    measured: Float[np.ndarray, "m 3"],
+    faces: Int[np.ndarray, "f 3"] | None,
+) -> Int[np.ndarray, "g 3"]:
+    """Return triangles of vertices in the plane, in the orientation of the measured faces where there are any."""
+    new_faces = triangulate(flat, MAX_EDGE_SPACINGS * spacing)
+    if faces is not None and _upward(plane, measured, faces) < 0:
+        return new_faces[:, ::-1].copy()
+    return new_faces
 
 
 def _upward(plane: SheetPlane, vertices: Float[np.ndarray, "m 3"], faces: Int[np.ndarray, "f 3"]) -> float:

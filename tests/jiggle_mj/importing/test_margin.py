@@ -49,8 +49,25 @@ def test_an_outline_in_the_world_bounds_the_sheet(tmp_path):
         ("margin = 5e-3\nspacing = 1e-6", MeshError, "at most 20000 are allowed: give a larger spacing"),
         ("margin = 1e9", MeshError, "at most 20000"),
         ("margin = -1", RecordingError, "margin must be a number above 0"),
+        (
+            "outline = [[-4e-3, -3e-3], [10e-3, 9e-3], [10e-3, -3e-3], [-4e-3, 9e-3]]",
+            RecordingError,
+            r"crosses itself: edges from corners 0 and 2 \(from 0\) intersect; give the corners in turn",
+        ),
+        (
+            "outline = [[-9e-3, -3e-3], [1e-3, -3e-3], [1e-3, 9e-3], [-9e-3, 9e-3]]",
+            RecordingError,
+            r"outline leaves out 6 of 12 points; it must surround what is seen",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_margin_is_named(tmp_path, lines, error, message):
     with pytest.raises(error, match=message):
         bring_in(folder(tmp_path, toml=with_mesh(lines)))
+
+
+def test_an_outline_through_the_outermost_points_surrounds_them(tmp_path):
+    """The grid is 6 x 4 mm, with points on three sides of the outline; the fourth is 4 mm further."""
+    lines = "outline = [[0, 0], [10e-3, 0], [10e-3, 4e-3], [0, 4e-3]]"
+    _, recording = bring_in(folder(tmp_path, toml=with_mesh(lines)))
+    np.testing.assert_allclose(recording.declaration.mesh.vertices.max(axis=0), [10e-3, 4e-3, 5e-3], atol=ROUNDING)
