@@ -35,6 +35,7 @@ from ..metrics.result import agreements
 from ..metrics.result_file import Json
 from ..metrics.truth_transfer import transfer
 from ..report.discrepancy_page import write_page
+from .check_before import check_before
 from .settings_used import settings_used, with_declared
 
 DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
@@ -53,6 +54,7 @@ def close_loop(
     mask: TissueMask | FrameMask | None = None,
     overwrite: bool = False,
     allow_truncated: bool = False,
+    allow_implausible: bool = False,
     tolerance_ns: int = PAIRING_TOLERANCE_NS,
     on_frame: OnFrame = lambda observation, estimate: None,
     log: Callable[[str], None] = lambda _: None,
@@ -70,9 +72,10 @@ def close_loop(
         mask: see `Estimator`.
         overwrite: replace an earlier run's files.
         allow_truncated: use the complete part of a recording, and of a truth, that was cut off.
+        allow_implausible: use a recording that `problems` refuses.
         tolerance_ns: largest difference between the stamps of one frame [ns].
         on_frame: called after each frame of the first estimate.
-        log: gets a line for each step of the work.
+        log: gets a line for each doubt about the recording, and for each step of the work.
 
     Returns:
         The content of discrepancy.json.
@@ -85,8 +88,9 @@ def close_loop(
     recording = Recording.open(recording_path, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     own = (DISCREPANCY, PAGE)
     check_directory(directory, own, overwrite=overwrite)
-    clear_directory(directory, own)
     declaration = with_declared(recording.declaration, declare)
+    check_before(recording, recording_path, declare, allow_implausible=allow_implausible, log=log)
+    clear_directory(directory, own)
     dataset = collect_dataset(declaration, recording.camera, recording, config=config, mask=mask, on_frame=on_frame)
     used = settings_used(declaration, dataset.estimator.config, declare=declare, declared=recording.declared)
     with jax.enable_x64(True), one_thread():

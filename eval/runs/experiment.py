@@ -53,6 +53,7 @@ from ..metrics.result_file import (
 )
 from ..report.run_page import shown_steps, write_report
 from .acting import actions, acts, check_policy_fits, policy_named
+from .check_before import check_before
 from .settings_used import settings_used, with_declared
 
 if TYPE_CHECKING:
@@ -175,8 +176,10 @@ def run_estimator(
     disparity: Disparity | None = None,
     overwrite: bool = False,
     allow_truncated: bool = False,
+    allow_implausible: bool = False,
     tolerance_ns: int = PAIRING_TOLERANCE_NS,
     on_frame: OnFrame | None = None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> Json:
     """Estimate from a recording, which holds observations only, and write the report.
 
@@ -189,8 +192,10 @@ def run_estimator(
         disparity: see `Estimator`.
         overwrite: replace an earlier run's files.
         allow_truncated: use the complete part of a recording that was cut off.
+        allow_implausible: use a recording that `problems` refuses.
         tolerance_ns: largest difference between the stamps of one frame [ns].
         on_frame: called after each frame.
+        log: gets a line for what is doubtful about the recording, and for what is assumed of its tissue.
 
     Returns:
         The content of result.json, without what needs the truth.
@@ -203,6 +208,7 @@ def run_estimator(
     own = (ESTIMATE, RESULT, REPORT)
     check_directory(directory, own, overwrite=overwrite)
     declaration = with_declared(recording.declaration, declare)
+    check_before(recording, recording_path, declare, allow_implausible=allow_implausible, log=log)
     estimator = Estimator(declaration, recording.camera, config=config, mask=mask, disparity=disparity)
     clear_directory(directory, own)
     name = recording.metadata.get("name", recording_path.stem)

@@ -23,7 +23,7 @@ from .options import (
     in_ns,
 )
 from .settings import configured, declared
-from .survey import check_before
+from .survey import doubt
 from .terminal import INTERRUPTED, console, deferred_interrupt, progress, show, stop
 
 if TYPE_CHECKING:
@@ -129,7 +129,6 @@ def estimate(
     tolerance_ns = in_ns(settings.pairing_tolerance)
     source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     mask = _mask(settings, source)
-    check_before(source, recording, declare, allow_implausible=settings.allow_implausible)
     with mask_shown(out), progress(len(source), f"estimate {recording.name}") as on_frame:
         figures = run_estimator(
             recording,
@@ -139,8 +138,10 @@ def estimate(
             mask=mask,
             overwrite=overwrite,
             allow_truncated=allow_truncated,
+            allow_implausible=settings.allow_implausible,
             tolerance_ns=tolerance_ns,
             on_frame=on_frame,
+            log=doubt,
         )
     show(figures, out, as_json)
 
@@ -162,6 +163,7 @@ def identify(
         as_json: print the ratios, the refusals and the resulting declaration to stdout as JSON.
     """
     from jiggle_mj.estimator import Estimator
+    from jiggle_mj.eval.runs.check_before import check_before
     from jiggle_mj.eval.runs.mask_files import mask_shown
     from jiggle_mj.eval.runs.settings_used import with_declared
 
@@ -172,7 +174,7 @@ def identify(
     tolerance_ns = in_ns(settings.pairing_tolerance)
     source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     mask = _mask(settings, source)
-    check_before(source, recording, declare, allow_implausible=settings.allow_implausible)
+    check_before(source, recording, declare, allow_implausible=settings.allow_implausible, log=doubt)
     estimator = Estimator(with_declared(source.declaration, declare), source.camera, config=config, mask=mask)
     with mask_shown(Path()), progress(len(source), f"estimate {recording.name}") as on_frame:
         episode.estimate(source, estimator, on_frame=on_frame)
@@ -235,7 +237,6 @@ def close_loop(
     tolerance_ns = in_ns(settings.pairing_tolerance)
     source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     mask = _mask(settings, source)
-    check_before(source, recording, declare, allow_implausible=settings.allow_implausible)
     with mask_shown(out), progress(len(source), f"follow {recording.name}") as on_frame:
         discrepancy = close(
             recording,
@@ -246,6 +247,7 @@ def close_loop(
             declare=declare,
             mask=mask,
             allow_truncated=allow_truncated,
+            allow_implausible=settings.allow_implausible,
             tolerance_ns=tolerance_ns,
             overwrite=overwrite,
             on_frame=on_frame,

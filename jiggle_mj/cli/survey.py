@@ -1,62 +1,22 @@
-"""The check before an estimate: the survey of a recording as a table, its problems as lines."""
+"""The survey of a recording as a table, and its problems as lines."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 
 from ..errors import RecordingError
+from ..plausibility.check import refuse_implausible
 from ..plausibility.problem import metres, seconds
-from ..plausibility.problems import problems
 from ..plausibility.survey import Survey, survey
 from ..recording.mcap_files import truth_path
 from ..recording.reader import Recording
 from .terminal import console
 
 
-def report(surveyed: Survey, path: Path, *, allow_implausible: bool = False, cure: str = "") -> None:
-    """Print what is doubtful about a recording.
-
-    Args:
-        surveyed: its survey.
-        path: its file, for messages.
-        allow_implausible: print what refuses it, and go on.
-        cure: ends the message of a refusal.
-
-    Raises:
-        RecordingError: the recording is implausible; names every reason.
-    """
-    found = problems(surveyed)
-    for problem in found:
-        if not problem.refuses or allow_implausible:
-            text = f"{problem.name}: {problem.text}"
-            console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
-    refused = [] if allow_implausible else [problem for problem in found if problem.refuses]
-    if refused:
-        reasons = " ".join(f"{problem.name}: {problem.text}" for problem in refused)
-        raise RecordingError(f"{path} is implausible. {reasons}{cure}")
-
-
-def check_before(recording: Recording, path: Path, declare: Mapping[str, Any], *, allow_implausible: bool) -> None:
-    """Check a recording before it is estimated, and say what is assumed of its tissue.
-
-    Args:
-        recording: an open recording.
-        path: its file, for messages.
-        declare: properties that the command line declares.
-        allow_implausible: see `report`.
-
-    Raises:
-        RecordingError: the recording is implausible.
-    """
-    from jiggle_mj.eval.runs.settings_used import assumed
-
-    cure = " (--allow-implausible goes on nevertheless)"
-    report(survey(recording), path, allow_implausible=allow_implausible, cure=cure)
-    assumption = assumed(recording.declaration, declare=declare, declared=recording.declared)
-    if assumption is not None:
-        console.print(assumption, style="bold yellow", markup=False, highlight=False, soft_wrap=True)
+def doubt(text: str) -> None:
+    """Print a line about what is doubtful."""
+    console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 def show_survey(path: Path) -> Survey:
@@ -73,7 +33,7 @@ def show_survey(path: Path) -> Survey:
         for name, value in rows(surveyed):
             table.add_row(name, value)
         console.print(table)
-        report(surveyed, path)
+        refuse_implausible(surveyed, path, log=doubt)
     except RecordingError:
         for written in (path, truth_path(path)):
             written.unlink(missing_ok=True)

@@ -5,8 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+import jiggle_mj as jm
 from jiggle_mj.camera import StereoCamera
+from jiggle_mj.errors import RecordingError
 from jiggle_mj.observation import IDENTITY_WXYZ, Declaration, MeasuredPoints, Observation, StereoPair, ToolState
+from jiggle_mj.plausibility.check import refuse_implausible
 from jiggle_mj.plausibility.problems import problems
 from jiggle_mj.plausibility.survey import survey
 from jiggle_mj.recording.reader import Recording
@@ -167,3 +170,21 @@ def test_a_camera_that_cannot_see_the_tool_is_refused(tmp_path, baseline, depth,
         for k in range(3)
     ]
     assert names(tmp_path, frames, camera=camera)[0] == refuses
+
+
+@pytest.mark.parametrize("job", [jm.run_estimator, jm.close_loop])
+def test_python_refuses_what_the_command_line_refuses(tmp_path, job):
+    """Before anything is estimated or written; the doubts come first."""
+    surveyed(tmp_path, Lift(still_tool=True, grasps=1).observations())
+    lines = list[str]()
+    with pytest.raises(RecordingError, match=r"is implausible\. tool-still: .*allow_implausible=True"):
+        job(tmp_path / "run.mcap", tmp_path / "out", log=lines.append)
+    assert [line.split(":")[0] for line in lines] == ["one-grasp"]
+    assert not list((tmp_path / "out").glob("*.*"))
+
+
+def test_what_is_allowed_is_reported(tmp_path):
+    lines = list[str]()
+    found = surveyed(tmp_path, Lift(still_tool=True).observations())
+    refuse_implausible(found, tmp_path / "run.mcap", log=lines.append, allow=True)
+    assert [line.split(":")[0] for line in lines] == ["tool-still"]
