@@ -39,6 +39,10 @@ class PointMotion:
         """Held tracks that no frame names."""
         self.held_at_closing = np.full(3, np.nan)
         """Mean of the held points when the jaws closed last [m]; NaN where none is seen."""
+        self.held_spread = 0.0
+        """Largest distance of a held point from that mean, over the grasps [m]."""
+        self.positions: Float[np.ndarray, "n 3"] | None = None
+        """Positions in the last frame, by track [m]."""
 
     @property
     def still_sd(self) -> float | None:
@@ -59,7 +63,7 @@ class PointMotion:
             still: whether the jaws have never closed yet.
             compare: whether to compare each point with its neighbours, which takes longest.
         """
-        positions = self._by_track(points)
+        self.positions = positions = self._by_track(points)
         self.n_seen += int(np.isfinite(positions[:, 0]).sum())
         self.n_expected += len(positions)
         assert self.rest is not None
@@ -98,6 +102,8 @@ class PointMotion:
         held = held[np.isfinite(held).all(axis=1)]
         self.held_at_closing = held.mean(axis=0) if len(held) else np.full(3, np.nan)
         if len(held):
+            spread = float(np.linalg.norm(held - self.held_at_closing, axis=1).max())
+            self.held_spread = max(self.held_spread, spread)
             return float(np.linalg.norm(self.held_at_closing - tool.position))
         return nearest_distance(positions, tool.position)
 

@@ -5,6 +5,7 @@ without a word. docs/RECORDINGS.md has them as a table.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from ..camera import MAX_BASELINE_M
 from .problem import RecordingProblem, metres, seconds
@@ -152,6 +153,10 @@ def _camera(survey: Survey) -> Iterator[RecordingProblem]:
 
 def _tool(survey: Survey) -> Iterator[RecordingProblem]:
     """Find a tool that is elsewhere, or of another clock, and a sheet that does not move."""
+    yield from survey.tool_doubts
+    if survey.why_apart is not None and survey.why_apart.refuses:
+        yield survey.why_apart
+        return
     distance, size = survey.tool_distance_m, survey.extent_m
     if distance is not None and size is not None and not survey.tool_by_points:
         if distance > max(MAX_TOOL_DISTANCE_M, FARTHEST_EXTENTS * size):
@@ -183,6 +188,11 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
             )
         elif survey.sensing == "points":
             yield _warn("held-still", "points move, and those that the tool holds do not; are the held rows right?")
+    if survey.why_apart is not None:
+        apart = held is not None and survey.tool_gap_m is not None and survey.tool_gap_m > max(held, tool) + noise
+        still = held is not None and tool < STILL_SHARE * held
+        yield replace(survey.why_apart, refuses=apart or still)
+        return
     if held is None or survey.tool_by_points or max(held, tool) <= noise:
         return
     if tool < STILL_SHARE * held:

@@ -13,10 +13,12 @@ from scipy.spatial.transform import Rotation
 from ..camera import StereoCamera
 from ..observation import Observation, ToolState
 from ..recording.reader import Recording
+from .held_motion import HeldMotion
 from .increments import SummedMotion
 from .point_motion import PointMotion, common, extent, nearest_distance, spacing
 from .point_problems import point_problems
 from .problem import RecordingProblem
+from .tool_problems import empty_grips, outliers, tip_offset, vertical, why_apart
 
 COMPARED_FRAMES = 40
 """Most frames in which points are compared with their neighbours, evenly over the recording, which bounds the time."""
@@ -74,6 +76,10 @@ class Survey:
     """Largest speed of the tool from frame to frame while the jaws are closed [m/s]."""
     tool_gap_m: float | None
     """Largest difference of the tool's displacement and that of the held points, since the jaws closed [m]."""
+    why_apart: RecordingProblem | None
+    """What explains that tool and held points move differently."""
+    tool_doubts: tuple[RecordingProblem, ...]
+    """What else is doubtful about the tool, and about the declared bed under what it lifts."""
     declared_sd_m: float | None
     """Noise of a coordinate as the recording states it [m]."""
     noise_sd_m: float | None
@@ -158,7 +164,7 @@ def survey(recording: Recording) -> Survey:
     Args:
         recording: an open recording; iterating it anew afterwards begins at its first frame.
     """
-    motion, closed, times = PointMotion(), _Closed(), list[int]()
+    motion, closed, times, track = PointMotion(), _Closed(), list[int](), HeldMotion()
     summed = SummedMotion()
     stride = max(1, len(recording) // COMPARED_FRAMES)
     first_cloud: Float[np.ndarray, "m 3"] | None = None
@@ -182,6 +188,7 @@ def survey(recording: Recording) -> Survey:
             first_cloud = points.positions if first_cloud is None else first_cloud
         closed.add(observation, held, motion.held_at_closing)
         summed.add(observation.tool, held)
+        track.add(observation, motion.held_at_closing + held, None if points is None else motion.positions)
     rest = motion.rest if motion.rest is not None else first_cloud
     if motion.still_sd is not None:
         noise_sd, noise_from = motion.still_sd, "still frames"
@@ -192,6 +199,19 @@ def survey(recording: Recording) -> Survey:
     depth, disparity, in_view = _in_camera(recording.camera, [tool.position for tool in closed.closings])
     distances = [distance for distance in closed.distances if np.isfinite(distance)]
     left = None if recording.camera is None else recording.camera.left
+    sd = noise_sd or 0.0
+    why = None if closed.by_points else why_apart(track, noise_sd=sd)
+    doubts = list[RecordingProblem]()
+    if rest is not None:
+        apart, gravity = spacing(rest) or 0.0, np.array(recording.declaration.gravity)
+        if not closed.by_points and why is None:
+            doubts += outliers(track, noise_sd=sd)
+            doubts += tip_offset(track, spread=motion.held_spread, spacing=apart)
+        if recording.declaration.mesh is None:
+            radius = max((tool.radius for tool in closed.closings if not tool.held_tracks), default=np.inf)
+            doubts += empty_grips(distances, reach=radius + apart)
+        if recording.declaration.bed and gravity.any():
+            doubts += vertical(track, rest, gravity, noise_sd=sd)
     return Survey(
         sensing="stereo" if recording.camera is not None and times else seen,
         frames=len(times),
@@ -216,6 +236,8 @@ def survey(recording: Recording) -> Survey:
         tool_path_m=closed.path,
         tool_speed_m_s=closed.speed,
         tool_gap_m=closed.gap,
+        why_apart=why,
+        tool_doubts=tuple(doubts),
         declared_sd_m=declared_sd,
         noise_sd_m=noise_sd,
         noise_from=noise_from,

@@ -1,0 +1,108 @@
+"""Tool and held points, frame by frame: while the jaws are closed both give the same motion."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..observation import Observation
+
+NS = 1e-9
+"""Seconds in a nanosecond [s]."""
+N_LEADING = 4
+"""Points whose mean step is that of the points that move most: fewer are a tracker's jumps."""
+
+
+@dataclass(kw_only=True)
+class HeldMotion:
+    """Where the tool and the points that it holds were, collected over the frames of a recording."""
+
+    _frames: list[tuple[int, int, Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]] = field(default_factory=list)
+    _reports: list[tuple[int, Float[np.ndarray, " 3"]]] = field(default_factory=list)
+    _shares: dict[bool, Float[np.ndarray, " 2"]] = field(
+        default_factory=lambda: {closed: np.zeros(2) for closed in (True, False)}
+    )
+    _last: tuple[Observation, Float[np.ndarray, "n 3"]] | None = None
+
+    def add(
+        self, observation: Observation, held: Float[np.ndarray, " 3"], positions: Float[np.ndarray, "n 3"] | None
+    ) -> None:
+        """Take one frame.
+
+        Args:
+            observation: the frame.
+            held: mean place of the held points [m]; NaN if unknown.
+            positions: of all points by track [m], NaN where unseen; None where there are none with identities.
+        """
+        tool = observation.tool
+        self._reports += [(report.time, report.position) for report in observation.reports]
+        self._reports.append((observation.time, tool.position))
+        if tool.closed and np.isfinite(held).all():
+            self._frames.append((observation.time, tool.grasp, tool.position, held))
+        if positions is None:
+            return
+        if self._last is not None and self._last[0].tool.closed == tool.closed:
+            before, was = self._last
+            n = min(len(was), len(positions))
+            step, leading = tool.position - before.tool.position, _leading(positions[:n] - was[:n])
+            if before.tool.grasp == tool.grasp:
+                self._shares[tool.closed] += np.array([leading @ step, step @ step])
+        self._last = observation, positions
+
+    def followed(self, *, closed: bool) -> tuple[float, float]:
+        """Return which share of the tool's steps the points follow that move most, and the root of the steps' squares.
+
+        Args:
+            closed: in frames with closed jaws, or in those with open ones.
+
+        Returns:
+            The share, 0 where the tool stands still, and the size of the steps [m].
+        """
+        together, squared = self._shares[closed]
+        return (float(together / squared) if squared > 0 else 0.0), float(np.sqrt(squared))
+
+    @property
+    def times(self) -> Float[np.ndarray, " n"]:
+        """Return the times of the frames with held points [s]."""
+        return np.array([time for time, *_ in self._frames]) * NS
+
+    @property
+    def grasps(self) -> Int[np.ndarray, " n"]:
+        """Return the grasp of each of them."""
+        return np.array([grasp for _, grasp, *_ in self._frames], int)
+
+    @property
+    def tool(self) -> Float[np.ndarray, "n 3"]:
+        """Return where the tool was in each of them [m]."""
+        return np.array([tool for *_, tool, _ in self._frames]).reshape(-1, 3)
+
+    @property
+    def held(self) -> Float[np.ndarray, "n 3"]:
+        """Return where the held points were in each of them [m]."""
+        return np.array([held for *_, held in self._frames]).reshape(-1, 3)
+
+    def path(self) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
+        """Return times [s] and positions [m] of all that the tool reported, in the order of time."""
+        in_turn = sorted(self._reports, key=lambda report: report[0])
+        return np.array([time for time, _ in in_turn]) * NS, np.array([place for _, place in in_turn]).reshape(-1, 3)
+
+
+def centred(places: Float[np.ndarray, "n 3"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """Return places relative to the mean of their group [m]."""
+    result = places.copy()
+    for group in np.unique(groups):
+        result[groups == group] -= places[groups == group].mean(axis=0)
+    return result
+
+
+def rms(vectors: Float[np.ndarray, "n 3"]) -> float:
+    """Return the root mean square length of vectors, in their unit."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def _leading(steps: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 3"]:
+    """Return the mean step of the points that move most [m]."""
+    seen = steps[np.isfinite(steps).all(axis=1)]
+    if not len(seen):
+        return np.zeros(3)
+    return seen[np.argsort(np.linalg.norm(seen, axis=1))[-N_LEADING:]].mean(axis=0)
