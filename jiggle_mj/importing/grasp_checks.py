@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import RecordingError
+from ..plausibility.held_motion import N_LEADERS
 from ..plausibility.increments import follow_in_sum
 from .clock import FrameClock
 from .grasps import GraspSpan
 from .recording_toml import MeasuredRecording
 from .reports import Reports
-from .units import LENGTH_UNITS, PREFERRED_UNITS
+from .units import LENGTH_UNITS
 
 MIN_MOTION = 5e-3
 """Displacement of the tool from which its points must follow [m]: well above the noise and drift of trackers (1 to 4
@@ -25,8 +26,8 @@ STILL_SHARE = 0.2
 STILL_REFUSED = 0.5
 """Share of the held points that stand still from which they are refused: with fewer, some slip or are lost; half are
 those of another corner."""
-N_LEADERS = 4
-"""Points that must move alike to lead: fewer are a tracker's jumps."""
+REFUSED_UNITS = {"inches": 0.0254, "decimetres": 0.1}
+"""Metres in further units that a tool may report in; they must be converted."""
 
 
 def refuse_wrong_grasps(
@@ -76,20 +77,25 @@ def _refuse_far(
         return
     tool, frame = given.grasp.tool, given.frame
     stated = given.unit if tool is None or tool.unit is None else tool.unit
-    raw = (tip - frame.translation) / stated
-    likely = next(
-        (
-            name
-            for name in PREFERRED_UNITS
-            if np.linalg.norm(places - (raw * LENGTH_UNITS[name] + frame.translation), axis=1).min() <= extent
-        ),
-        None,
-    )
-    cure = "" if likely is None else f'give tool_unit = "{likely}", or '
+    closed = range(grasp.closing, grasp.frames[1])
+    raw = (np.stack([reports.at(clock.times[k])[0] for k in closed]) - frame.translation) / stated
+    held = frames[grasp.closing : grasp.frames[1]][:, grasp.held]
+    # Over the whole grasp: near the origin every small unit is near when the jaws close, and only one moves along.
+    away = {
+        name: float(np.nanmax(np.linalg.norm(held - (raw * factor + frame.translation)[:, np.newaxis], axis=2)))
+        for name, factor in (LENGTH_UNITS | REFUSED_UNITS).items()
+    }
+    likely = min(away, key=away.__getitem__)
+    cure = "" if away[likely] > extent else f"{_unit_cure(likely)}, and it stays within {away[likely]:.3g} m; or "
     raise RecordingError(
         f"{grasp.what}: the tool is {distance:.4g} m from the nearest held point when the jaws close, and the sheet "
         f"is {extent:.3g} m large: {cure}transform the tool into the frame of the points."
     )
+
+
+def _unit_cure(unit: str) -> str:
+    """Return what to do about a tool that reports in a unit."""
+    return f'give tool_unit = "{unit}"' if unit in LENGTH_UNITS else f"convert its positions from {unit} to m"
 
 
 def _refuse_still(
@@ -104,20 +110,22 @@ def _refuse_still(
     closed = range(grasp.closing, grasp.frames[1])
     moved = frames[grasp.closing : grasp.frames[1]] - frames[grasp.closing]
     least = max(MIN_MOTION, MOTION_NOISE * given.noise_sd)
+    leaders = {"the points that move most": _leading(moved)}
     if reports is not None:
         tips = np.stack([reports.at(clock.times[k])[0] for k in closed])
-        leading, leader = tips - tips[0], "the tool"
-    else:
-        leading, leader = _leading(moved), "the points that move most"
-    far = np.linalg.norm(leading, axis=1)
-    at = int(np.argmax(far))
-    if far[at] < least:
+        leaders["the tool"] = tips - tips[0]
+    leaders = {name: leading for name, leading in leaders.items() if np.linalg.norm(leading, axis=1).max() >= least}
+    # Points that follow one of them are held: where the other differs, the tool's unit, frame or clock is wrong.
+    shares = [_shares(moved[:, grasp.held], leading) for leading in leaders.values()]
+    if not shares:
         return
-    share = moved[at][grasp.held] @ leading[at] / far[at] ** 2
+    share = np.max(shares, axis=0)
     share = share[np.isfinite(share)]
     still = int((share < STILL_SHARE).sum())
     if not len(share) or still < STILL_REFUSED * len(share):
         return
+    leader, leading = list(leaders.items())[-1]
+    far = float(np.linalg.norm(leading, axis=1).max())
     if follow_in_sum(moved[:, grasp.held].mean(axis=1), leading):
         raise RecordingError(
             f"{grasp.what}: the held points do not follow {leader}, and the sum of their displacements over the frames "
@@ -129,9 +137,16 @@ def _refuse_still(
         else "check rows, after and the tool's clock; where there are several pulls, give each its own [[grasp]]"
     )
     raise RecordingError(
-        f"{grasp.what}: {still} of {len(share)} held points stand still while {leader} moves "
-        f"{far[at] * 1e3:.3g} mm, so they are not what it holds: {cure}."
+        f"{grasp.what}: {still} of {len(share)} held points stand still while {leader} went "
+        f"{far * 1e3:.3g} mm, so they are not what it holds: {cure}."
     )
+
+
+def _shares(moved: Float[np.ndarray, "t h 3"], leading: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, " h"]:
+    """Return which share of the leading displacement each point has, where that is largest."""
+    far = np.linalg.norm(leading, axis=1)
+    at = int(np.argmax(far))
+    return moved[at] @ leading[at] / far[at] ** 2
 
 
 def _leading(moved: Float[np.ndarray, "t n 3"]) -> Float[np.ndarray, "t 3"]:

@@ -4,12 +4,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from ..plausibility.held_motion import N_LEADERS
+
 MOST_HELD = 12
 """Points that are guessed to be held, at most."""
 HELD_SHARE = 0.8
 """Displacement from which a point is guessed to be held, as a share of that of the leading points."""
-N_LEADERS = 4
-"""Points that must move alike to lead."""
 FIRST_SHARE = 0.3
 """The pull has begun where the leading points have moved by this share of their largest displacement."""
 N_NEIGHBOURS = 6

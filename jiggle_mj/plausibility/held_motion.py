@@ -9,8 +9,8 @@ from ..observation import Observation
 
 NS = 1e-9
 """Seconds in a nanosecond [s]."""
-N_LEADING = 4
-"""Points whose mean step is that of the points that move most: fewer are a tracker's jumps."""
+N_LEADERS = 4
+"""Points whose mean displacement is that of the points that move most: fewer are a tracker's jumps."""
 
 
 @dataclass(kw_only=True)
@@ -105,4 +105,4 @@ def _leading(steps: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 3"]:
     seen = steps[np.isfinite(steps).all(axis=1)]
     if not len(seen):
         return np.zeros(3)
-    return seen[np.argsort(np.linalg.norm(seen, axis=1))[-N_LEADING:]].mean(axis=0)
+    return seen[np.argsort(np.linalg.norm(seen, axis=1))[-N_LEADERS:]].mean(axis=0)

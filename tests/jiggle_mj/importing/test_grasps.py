@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from jiggle_mj.errors import RecordingError
+from jiggle_mj.plausibility.problems import problems
+from jiggle_mj.plausibility.survey import survey
 from tests.support.measured_folder import bring_in
 
 PULL = 30.0
@@ -84,7 +86,7 @@ ONE_LIST = TWO_PULLS[: TWO_PULLS.index("[[grasp]]")] + "[grasp]\nrows = [{rows}]
 @pytest.mark.parametrize("tool", ["", TOOL])
 @pytest.mark.parametrize("rows", ["0, 1, 6, 7", "0, 1, 6, 7, 28, 29, 34, 35"])
 def test_one_list_for_pulls_at_two_corners_is_refused_with_the_cure(tmp_path, tool, rows):
-    with pytest.raises(RecordingError, match=r"held points stand still while .* moves 30 mm.*\[\[grasp\]\]"):
+    with pytest.raises(RecordingError, match=r"held points stand still while .* went 30 mm.*\[\[grasp\]\]"):
         bring_in(two_pulls(tmp_path, ONE_LIST.format(rows=rows, tool=tool)))
 
 
@@ -132,3 +134,27 @@ def test_a_second_clock_is_brought_to_that_of_the_frames(tmp_path, offset, shift
     toml = TWO_PULLS.format(first=f"{TOOL}\ntool_clock_offset = {offset}", second="rows = [28, 29, 34, 35]")
     _, recording = bring_in(two_pulls(tmp_path, toml, at=shift + 0.5 * np.arange(8)))
     np.testing.assert_allclose([frame.tool.position[2] for frame in recording], [0, 0.01, 0.02, 0.03] * 2, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("per_metre", "cure"),
+    [(1e3, 'tool_unit = "mm"'), (1e2, 'tool_unit = "cm"'), (1e6, 'tool_unit = "um"'),
+     (1 / 0.0254, "convert its positions from inches to m"), (10, "convert its positions from decimetres to m")],
+)  # fmt: skip
+def test_the_unit_in_which_the_tool_stays_at_its_points_is_the_cure(tmp_path, per_metre, cure):
+    """The first tip is 7 mm from the origin, so that every smaller unit puts it near its points as well."""
+    where = two_pulls(tmp_path, TWO_PULLS.format(first=TOOL + '\ntool_unit = "m"', second="rows = [28, 29, 34, 35]"))
+    with np.load(where / "d.npz") as arrays:
+        np.savez(where / "d.npz", **(dict(arrays) | {"tip": 1e-3 * arrays["tip"] * per_metre}))
+    with pytest.raises(RecordingError, match=cure):
+        bring_in(where)
+
+
+def test_a_mirrored_tool_does_not_make_its_points_stand_still(tmp_path):
+    """They follow the points that move most; that the tool goes down is for the survey to say."""
+    where = two_pulls(tmp_path, TWO_PULLS.format(first=TOOL, second="rows = [28, 29, 34, 35]"))
+    with np.load(where / "d.npz") as arrays:
+        np.savez(where / "d.npz", **(dict(arrays) | {"tip": arrays["tip"] * [1, 1, -1]}))
+    summary, recording = bring_in(where)
+    assert summary.n_frames == 8
+    assert "tool-axes" in {problem.name for problem in problems(survey(recording))}
