@@ -26,6 +26,9 @@ STILL_SHARE = 0.2
 STILL_REFUSED = 0.5
 """Share of the held points that stand still from which they are refused: with fewer, some slip or are lost; half are
 those of another corner."""
+NEAR_SHARE = 0.5
+"""Distance of the tool from its points at which a unit is offered [extent of the sheet]: in a far too small unit the
+tool stays at the origin, which for a sheet around it is 0.7 extents from a corner."""
 REFUSED_UNITS = {"inches": 0.0254, "decimetres": 0.1}
 """Metres in further units that a tool may report in; they must be converted."""
 
@@ -86,7 +89,11 @@ def _refuse_far(
         for name, factor in (LENGTH_UNITS | REFUSED_UNITS).items()
     }
     likely = min(away, key=away.__getitem__)
-    cure = "" if away[likely] > extent else f"{_unit_cure(likely)}, and it stays within {away[likely]:.3g} m; or "
+    cure = (
+        ""
+        if away[likely] > NEAR_SHARE * extent
+        else f"{_unit_cure(likely)}, and it stays within {away[likely]:.3g} m; or "
+    )
     raise RecordingError(
         f"{grasp.what}: the tool is {distance:.4g} m from the nearest held point when the jaws close, and the sheet "
         f"is {extent:.3g} m large: {cure}transform the tool into the frame of the points."

@@ -233,7 +233,8 @@ def _tool(tables: list[StrictTable]) -> ReportedTool | None:
     for table in tables:
         for key in TOOL_KEYS:
             value = table.values.get(key)
-            if value is not None and merged.setdefault(key, value) != value:
+            # NaN differs from itself; it is refused as a value below.
+            if value is not None and merged.setdefault(key, value) != value and value == value:
                 raise RecordingError(f"{table.where} {key} differs from that of another grasp; there is one tool.")
     if not merged:
         return None

@@ -9,18 +9,25 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..errors import RecordingError
 from ..observation import IDENTITY_WXYZ, ToolReport
 from ..recording.schemas import NS_PER_S
-from .clock import FrameClock, absolute_times
+from .clock import LIKELY_PERIOD, FrameClock, absolute_times
 from .data_folder import DataFolder
 from .grasp_table import START_TOGETHER, ReportedTool
 from .points.archives import read_array
 from .points.measured import in_space
 from .recording_toml import MeasuredRecording
+from .units import TIME_UNITS
 
 MAX_AGE = 100_000_000
 """Time before the first and after the last report for which that report still holds [ns], as a recording's reader has
 it for poses."""
 MAX_OUTSIDE = 0.1
 """Share of frames outside the reports above which the clocks are taken to differ; fewer are left out and named."""
+FAR_SPANS, FEW_SPANS = 100, 5
+"""Spans of the frames within which reports are in the right unit of time: a robot reports for some time before and
+after the frames, or not quite to their ends. Units differ by 1000, so that one fits at most."""
+MIN_INSIDE = 2
+"""Reports at the time of the frames up to which the tool moves on one straight line: with times of a unit that is too
+large, all but the first come after the last frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,10 +106,36 @@ def _times(
     else:
         shift = round(tool.clock_offset * NS_PER_S) - clock.origin
     times = [time + shift for time in absolute]
+    _refuse_unit(times, unit, tool, clock)
     limit = np.iinfo(np.int64).max // 4
     if max(-times[0], times[-1]) > limit:
         raise RecordingError(_apart(times, tool, clock))
     return np.array(times, np.int64)
+
+
+def _refuse_unit(times: list[int], unit: int, tool: ReportedTool, clock: FrameClock) -> None:
+    """Refuse times that last as long as the frames in another unit, and in theirs far longer, or far shorter.
+
+    Raises:
+        RecordingError: names that unit.
+    """
+    span, frames = times[-1] - times[0], clock.times[-1]
+    inside = sum(0 <= time <= frames for time in times)
+    if not frames or (span >= frames / FAR_SPANS and inside > MIN_INSIDE):
+        return
+    shortest = round(LIKELY_PERIOD[0] * NS_PER_S) * (len(times) - 1)
+    likely = [
+        name
+        for name, each in TIME_UNITS.items()
+        if max(frames / FEW_SPANS, shortest) <= span * each / unit <= FAR_SPANS * frames
+    ]
+    stated = next(name for name, each in TIME_UNITS.items() if each == unit)
+    if likely and stated not in likely:
+        raise RecordingError(
+            f"the tool's times {tool.times} in {stated} last {span / NS_PER_S:.4g} s, and the frames "
+            f'{frames / NS_PER_S:.4g} s: give tool_time_unit = "{likely[0]}", and tool_clock_offset if the clocks '
+            "differ."
+        )
 
 
 def _turns(folder: DataFolder, given: MeasuredRecording, tool: ReportedTool, count: int) -> Rotation:
@@ -115,8 +148,12 @@ def _turns(folder: DataFolder, given: MeasuredRecording, tool: ReportedTool, cou
             f"{archive}: {tool.orientations} must have shape ({count}, 4), w first; it has {quaternions.shape}."
         )
     length = np.linalg.norm(quaternions, axis=1)
-    if not (np.isfinite(length) & (length > 0)).all():
-        raise RecordingError(f"{archive}: {tool.orientations} must be finite quaternions that are not zero.")
+    bad = np.flatnonzero(~(np.isfinite(length) & (length > 0)))
+    if len(bad):
+        raise RecordingError(
+            f"{archive}: {tool.orientations} must be finite quaternions that are not zero; report {bad[0]} (from 0) is "
+            f"{quaternions[bad[0]].tolist()}: leave it out, or drop tool_turns."
+        )
     return Rotation.from_quat(quaternions, scalar_first=True)
 
 
@@ -131,6 +168,11 @@ def _refuse_outside(reports: Reports, tool: ReportedTool, clock: FrameClock) -> 
 def _apart(times: list[int], tool: ReportedTool, clock: FrameClock) -> str:
     first, last = times[0] / NS_PER_S, times[-1] / NS_PER_S
     cure = (0.0 if tool.clock_offset is None else tool.clock_offset) - first
+    if -MAX_AGE <= times[0] <= MAX_AGE:
+        return (
+            f"the tool's reports end after {last:.6g} s, the frames after {clock.times[-1] / NS_PER_S:.6g} s; both "
+            "begin together: leave out the frames without reports, or correct tool_clock_offset or tool_time_unit."
+        )
     return (
         f"the tool's reports span {first:.10g} to {last:.10g} s from the first frame, the frames 0 to "
         f"{clock.times[-1] / NS_PER_S:.6g} s: they do not overlap as they must. Give tool_clock_offset, what is added "

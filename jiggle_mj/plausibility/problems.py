@@ -199,7 +199,7 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
         yield _refuse(
             "tool-still",
             f"the tool moves {metres(tool)} while the points that it holds move {metres(held)}; do the clocks of tool "
-            "and frames overlap (one offset from the other, one since 1970), and are both in metres?",
+            "and frames overlap (one since 1970 or in ms: tool_clock_offset, tool_time_unit), and are both in metres?",
         )
     elif held < STILL_SHARE * tool:
         yield _warn(

@@ -35,8 +35,9 @@ LEAST_DRIFT = 3e-3
 """Drift that is named: quartz clocks differ by less than 1e-4, frame rates of 29.97 and 30 by 1e-3."""
 SEARCHED_S, SEARCHED_PERIODS, SEARCHED_DRIFT = 2.0, 3.0, 0.1
 """Largest shift that is tried [s, median periods], and largest drift."""
-N_GRID = 20
-"""Steps of the search on each side of 0; it is then refined three times around the best."""
+N_SHIFTS, N_DRIFTS = 100, 20
+"""Steps of the search on each side of 0: of a shift alone, and of shift and drift together; it is then refined three
+times around the best. A shift of 2 s is searched in steps of 20 ms, since tools move fast from grasp to grasp."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,10 +158,11 @@ def clock_fit(track: HeldMotion, *, noise: float) -> ClockFit | None:
 
 def _search(left: Callable[[float, float], float], span: float, drift_span: float) -> tuple[float, float]:
     """Return shift [s] and drift with the least difference, on grids that become finer."""
-    late, drift, n_drifts = 0.0, 0.0, N_GRID if drift_span else 0
+    late, drift = 0.0, 0.0
+    n_shifts, n_drifts = (N_DRIFTS, N_DRIFTS) if drift_span else (N_SHIFTS, 0)
     for _ in range(4):
-        shifts = late + span * np.arange(-N_GRID, N_GRID + 1) / N_GRID
+        shifts = late + span * np.arange(-n_shifts, n_shifts + 1) / n_shifts
         drifts = drift + drift_span * np.arange(-n_drifts, n_drifts + 1) / max(n_drifts, 1)
         late, drift = min(itertools.product(shifts.tolist(), drifts.tolist()), key=lambda each: left(*each))
-        span, drift_span = 2 * span / N_GRID, 2 * drift_span / max(n_drifts, 1)
+        span, drift_span = 2 * span / n_shifts, 2 * drift_span / max(n_drifts, 1)
     return late, drift

@@ -117,3 +117,44 @@ def test_what_is_wrong_with_runs_and_reports_is_named(tmp_path, changed, arrays,
     where = reported_folder(tmp_path, toml=REPORTED.replace(*changed) if changed[0] else REPORTED, **arrays)
     with pytest.raises(RecordingError, match=message):
         bring_in(where)
+
+
+@pytest.mark.parametrize(("per_second", "stated", "right"), [(1e3, "s", "ms"), (1e6, "ms", "us"), (1.0, "ms", "s")])
+def test_the_unit_in_which_the_reports_last_as_long_as_the_frames_is_named(tmp_path, per_second, stated, right):
+    """4 s of reports for 3 s of frames; in a unit that is too large their times cover those of the frames."""
+    toml = REPORTED.replace("after = 0.5", f'after = 0.5\ntool_time_unit = "{stated}"')
+    at = per_second * np.arange(0, 4.01, 0.2)
+    with pytest.raises(RecordingError, match=f'give tool_time_unit = "{right}"'):
+        bring_in(reported_folder(tmp_path, toml=toml, t=np.array([0.0, 0.5, 1.0, 2.0, 2.5, 3.0]), at=at))
+
+
+def test_a_long_log_of_another_clock_has_no_other_unit(tmp_path):
+    """50 reports a second over half an hour would be 50 000 a second in milliseconds: the clocks differ."""
+    at = 1e6 + np.arange(0, 1800, 0.02)
+    tip, turn = np.zeros((len(at), 3)), np.tile([1.0, 0, 0, 0], (len(at), 1))
+    with pytest.raises(RecordingError, match="tool_clock_offset, what is added"):
+        bring_in(reported_folder(tmp_path, at=at, tip=tip, turn=turn))
+
+
+def test_a_clock_offset_that_is_no_number_is_refused_as_such(tmp_path):
+    """NaN differs from itself, and so from that of another grasp too."""
+    one = REPORTED.replace("[grasp]", "[[grasp]]\nrun = 1").replace("after = 0.5", "tool_clock_offset = nan")
+    grasp = one[one.index("[[grasp]]") : one.index("[truth]")]
+    toml = one.replace("[truth]", grasp.replace("run = 1", "run = 2") + "[truth]")
+    with pytest.raises(RecordingError, match=r"tool_clock_offset must be a number.*got nan"):
+        bring_in(reported_folder(tmp_path, toml=toml))
+
+
+def test_reports_that_end_too_early_have_no_other_clock(tmp_path):
+    """Those of the first second of three: an offset of 0 would be no cure."""
+    at = 7.0 + np.arange(0, 1.01, 0.2)
+    arrays = {"at": at, "tip": np.zeros((len(at), 3)), "turn": np.tile([1.0, 0, 0, 0], (len(at), 1))}
+    with pytest.raises(RecordingError, match=r"end after 1 s, the frames after 3 s.*leave out the frames"):
+        bring_in(reported_folder(tmp_path, **arrays))
+
+
+def test_a_quaternion_of_zeros_is_named_with_its_report(tmp_path):
+    turn = np.tile([1.0, 0, 0, 0], (21, 1))
+    turn[3] = 0
+    with pytest.raises(RecordingError, match=r"report 3 \(from 0\) is \[0\.0, 0\.0, 0\.0, 0\.0\]"):
+        bring_in(reported_folder(tmp_path, turn=turn))
