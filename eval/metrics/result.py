@@ -85,6 +85,7 @@ def result(run: Run) -> Json:
         "detection": {
             "rule": detection.rule,
             "n_detected": int(detection.attached.sum()),
+            "n_expected": float(detection.score.sum()) if detection.probabilistic else None,
             "n_attached": None,
             "n_observable": None,
             "by_dilation": {str(rings): dict(NO_AGREEMENT) for rings in DILATIONS},

@@ -21,14 +21,14 @@ def check_before(
     allow_implausible: bool,
     log: Callable[[str], None],
 ) -> None:
-    """Check a recording before it is estimated, and say what is assumed of its tissue.
+    """Check a recording before it is estimated, and say what is assumed of its tissue and what takes long.
 
     Args:
         recording: an open recording.
         path: its file, for messages.
         declare: properties that the caller declares over those of the recording.
         allow_implausible: report what refuses the recording, and go on.
-        log: gets a line for each doubt and assumption.
+        log: gets a line for each doubt and assumption, and one on compilation.
 
     Raises:
         RecordingError: the recording is implausible.
@@ -37,3 +37,4 @@ def check_before(
     assumption = assumed(recording.declaration, declare=declare, declared=recording.declared)
     if assumption is not None:
         log(assumption)
+    log("the first frames wait for compilation, about half a minute for a sheet of new size")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from ..errors import OptionError
+from ..errors import OptionError, RecordingError
 from ..options import FilterName, PolicyName, Sensing
 from .options import (
     AS_DECLARED,
@@ -282,6 +282,8 @@ def score(
     """
     from jiggle_mj.eval.runs.experiment import score_directory
 
+    if not truth.exists():
+        raise RecordingError(f"{truth} does not exist; 'import' writes one where recording.toml has a [truth].")
     figures = score_directory(directory, truth, recording=recording, allow_truncated=allow_truncated, log=console.print)
     show(figures, directory, as_json)
 

@@ -128,6 +128,8 @@ def _check_verb(arguments: list[str], *, lost_output: bool) -> None:
         raise OptionError("stdout is closed, and the result would go there; redirect it to a file.")
     if first in ("-h", "--help") or first in VERBS or first.startswith("--tyro-"):
         return
+    if first.startswith("-") and set(arguments) & set(VERBS):
+        raise OptionError(f"{first} stands before the verb; options come after it: jiggle-mj VERB ... {first} ...")
     known = [*VERBS, "--help", "--version"]
     what = f"no verb {first!r}{did_you_mean(first, known)}" if first else "a verb is missing."
     raise OptionError(f"{what} There are {', '.join(VERBS)}; 'jiggle-mj --help' explains them.")

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ..observation import Observation
 
 console = Console(stderr=True)
+WORTH_SAYING = 0.5
+"""Sum of P(attached) from which it is said where no particle is reported: likelier than not, one is attached."""
 FAILED, WRONG_USAGE = 1, 2
 """Exit codes of a run that failed, and of arguments that cannot be used."""
 
@@ -102,6 +104,9 @@ def show(figures: dict, out: Path, as_json: bool) -> None:
         f"{detection['n_detected']} of {figures['n_particles']} particles reported attached ({detection['rule']})",
         markup=False,
     )
+    expected = detection.get("n_expected") or 0.0  # not in results of older versions
+    if not detection["n_detected"] and expected >= WORTH_SAYING:
+        console.print(f"P(attached) sums to {expected:.1f}: something holds softly, or where it holds is not certain.")
     if detection["n_attached"] is not None:
         table = Table("rings", "PCD %", "PUG %", "F1 %", box=None)
         for rings, figure in detection["by_dilation"].items():

@@ -4,7 +4,8 @@ BY_DILATION = {rings: dict.fromkeys(("pcd", "pug", "f1")) for rings in "012"}
 KEYS = {
     **dict.fromkeys(("scene", "seed", "sensing", "estimator", "policy", "disturbances", "n_particles", "n_frames")),
     "detection": {
-        **dict.fromkeys(("rule", "n_detected", "n_attached", "n_observable", "average_precision", "converged")),
+        **dict.fromkeys(("rule", "n_detected", "n_expected", "n_attached", "n_observable")),
+        **dict.fromkeys(("average_precision", "converged")),
         "by_dilation": BY_DILATION,
         "observable": {"by_dilation": BY_DILATION},
     },

@@ -77,20 +77,20 @@ EPISODE = Episode(
 )
 
 
+RUN = Run(
+    scene="by hand",
+    seed=3,
+    sensing="points",
+    estimator="implicit",
+    policy="corners",
+    episode=EPISODE,
+    settings=settings_used(Declaration(), EstimatorConfig(), declare=None, declared=True),
+)
+
+
 def unscored(limits: Limits | None = None) -> dict:
     """Return the run's result without truth."""
-    return result(
-        Run(
-            scene="by hand",
-            seed=3,
-            sensing="points",
-            estimator="implicit",
-            policy="corners",
-            episode=EPISODE,
-            limits=limits,
-            settings=settings_used(Declaration(), EstimatorConfig(), declare=None, declared=True),
-        )
-    )
+    return result(replace(RUN, limits=limits))
 
 
 def scored(limits: Limits | None = None, **changes) -> dict:

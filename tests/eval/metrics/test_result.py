@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jiggle_mj.cli.terminal import show
 from jiggle_mj.errors import OutputError, RecordingError
-from jiggle_mj.eval.metrics.result import score
+from jiggle_mj.eval.metrics.result import result, score
 from jiggle_mj.eval.metrics.result_file import read_result, write_result
 from jiggle_mj.limits import Limits
 from jiggle_mj.recording.estimate import EstimateWriter
@@ -15,8 +16,10 @@ from jiggle_mj.recording.truth import write_truth
 from tests.support.result_keys import KEYS, keys
 from tests.support.scored_run import (
     DETECTION,
+    EPISODE,
     ESTIMATES,
     REST,
+    RUN,
     SHEET,
     STIFFNESS,
     TRUTH,
@@ -41,6 +44,17 @@ def test_the_estimators_own_figures_by_hand():
     assert figures["timing"]["update_s"] == pytest.approx({"median": 0.2, "p95": 0.29})
     assert figures["entropy"] == {"prior": 9.0, "final": 3.0}
     assert figures["detection"]["n_detected"] == 2 and figures["detection"]["n_attached"] is None
+    assert figures["detection"]["n_expected"] is None  # the scores 3, 2 and 1 are no probabilities
+
+
+def test_where_none_is_reported_the_sum_of_the_probabilities_is_said(tmp_path, capsys):
+    """0.4 + 0.3 + 0.2 = 0.9 of a particle; with 0.2 alone, none is likelier than one."""
+    for p, said in (((0.4, 0.3, 0.2, 0, 0, 0), True), ((0.2, 0, 0, 0, 0, 0), False)):
+        soft = replace(DETECTION, attached=np.zeros(6, bool), score=np.array(p), probabilistic=True)
+        figures: dict = result(replace(RUN, episode=replace(EPISODE, detection=soft)))
+        assert figures["detection"]["n_expected"] == pytest.approx(sum(p))
+        show(figures, tmp_path, as_json=False)
+        assert ("P(attached) sums to 0.9" in capsys.readouterr().err) is said
 
 
 def test_the_truths_figures_by_hand():

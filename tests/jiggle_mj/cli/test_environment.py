@@ -94,11 +94,17 @@ def test_ctrl_c_during_imports_is_quiet():
         (("table", "active", "--sedes", "3", "--out", "x"), "no option '--sedes'; did you mean '--seeds'?"),
         (("record", "ark", "--out", "x"), "no scene named 'ark'; did you mean 'arc'?"),
         ((), "a verb is missing. There are run, record"),
+        (("--mask", "m.png", "estimate", "x.mcap"), "--mask stands before the verb; options come after"),
     ],
 )
 def test_the_likely_word_is_proposed(arguments: tuple[str, ...], likely: str, monkeypatch, capsys):
     assert call(monkeypatch, *arguments) == 2
     assert likely in capsys.readouterr().err
+
+
+def test_a_truth_that_is_not_there_says_what_writes_it(monkeypatch, capsys, tmp_path):
+    assert call(monkeypatch, "score", tmp_path, "--truth", tmp_path / "run.truth.mcap") == 1
+    assert "'import' writes one where recording.toml has a [truth]" in capsys.readouterr().err.replace("\n", " ")
 
 
 @pytest.mark.parametrize(
