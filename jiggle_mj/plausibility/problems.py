@@ -47,7 +47,7 @@ MAX_UNSEEN = 0.5
 def problems(survey: Survey) -> tuple[RecordingProblem, ...]:
     """Return all problems of a surveyed recording, those that refuse it first."""
     found = [*_use(survey), *_size(survey), *_times(survey), *_camera(survey), *_tool(survey), *_noise(survey)]
-    found += survey.point_doubts
+    found += (*survey.point_doubts, *survey.image_doubts)
     return tuple(sorted(found, key=lambda problem: not problem.refuses))
 
 

@@ -14,6 +14,7 @@ from ..camera import StereoCamera
 from ..observation import Observation, ToolState
 from ..recording.reader import Recording
 from .held_motion import HeldMotion
+from .image_problems import image_problems
 from .increments import SummedMotion
 from .point_motion import PointMotion, common, extent, nearest_distance, spacing
 from .point_problems import point_problems
@@ -96,6 +97,8 @@ class Survey:
     """Disparity at that distance [px]."""
     tool_in_view: bool | None
     """Whether the tool is inside the left image whenever the jaws close."""
+    image_doubts: tuple[RecordingProblem, ...]
+    """What is wrong or doubtful about the images."""
     declared: bool
     """Whether the recording declares the tissue; else the defaults hold."""
 
@@ -159,19 +162,21 @@ class _Closed:
 
 
 def survey(recording: Recording) -> Survey:
-    """Return what a recording holds in numbers, from one pass over its usable frames.
+    """Return what a recording holds in numbers, from one pass over its usable frames, and from a few images.
 
     Args:
         recording: an open recording; iterating it anew afterwards begins at its first frame.
     """
     motion, closed, times, track = PointMotion(), _Closed(), list[int](), HeldMotion()
     summed = SummedMotion()
+    tools: list[tuple[int, ToolState]] = []
     stride = max(1, len(recording) // COMPARED_FRAMES)
     first_cloud: Float[np.ndarray, "m 3"] | None = None
     declared_sd: float | None = None
     identified = False
     for observation in recording.without_images():
         times.append(observation.time)
+        tools.append((observation.index, observation.tool))
         points, held = observation.points, np.full(3, np.nan)
         if points is not None and len(points.positions):
             declared_sd = points.sd if declared_sd is None else declared_sd
@@ -189,6 +194,7 @@ def survey(recording: Recording) -> Survey:
         closed.add(observation, held, motion.held_at_closing)
         summed.add(observation.tool, held)
         track.add(observation, motion.held_at_closing + held, None if points is None else motion.positions)
+    skipped = list(recording.skipped)
     rest = motion.rest if motion.rest is not None else first_cloud
     if motion.still_sd is not None:
         noise_sd, noise_from = motion.still_sd, "still frames"
@@ -215,8 +221,8 @@ def survey(recording: Recording) -> Survey:
     return Survey(
         sensing="stereo" if recording.camera is not None and times else seen,
         frames=len(times),
-        first_skipped=recording.skipped[0][1] if recording.skipped else "",
-        skipped=len(recording.skipped),
+        first_skipped=skipped[0][1] if skipped else "",
+        skipped=len(skipped),
         span_s=(times[-1] - times[0]) * NS if times else 0.0,
         period_s=float(np.median(steps)) * NS if len(steps) else None,
         largest_gap_s=None if closed.largest_gap_ns is None else closed.largest_gap_ns * NS,
@@ -246,6 +252,7 @@ def survey(recording: Recording) -> Survey:
         tool_depth_m=depth,
         tool_disparity_px=disparity,
         tool_in_view=in_view,
+        image_doubts=tuple(image_problems(recording, tools)),
         declared=recording.declared,
     )
 

@@ -8,7 +8,7 @@ import math
 import os
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -126,13 +126,17 @@ class Recording:
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the usable observations in file order."""
-        return self._observations(images=True)
+        return self._observations(range(len(self)))
 
     def without_images(self) -> Iterator[Observation]:
         """Yield the usable observations without their images, which takes much less time; images are not checked."""
-        return self._observations(images=False)
+        return self.with_images_of(())
 
-    def _observations(self, *, images: bool) -> Iterator[Observation]:
+    def with_images_of(self, indices: Container[int]) -> Iterator[Observation]:
+        """Yield the usable observations, those of some indices with their images; other images are not checked."""
+        return self._observations(indices)
+
+    def _observations(self, with_images: Container[int]) -> Iterator[Observation]:
         self.skipped = []
         latest: int | None = None
         last_pose: Stamped | None = None
@@ -145,7 +149,7 @@ class Recording:
                 if latest is not None and group.stamp <= latest:
                     raise RecordingError(f"time goes backwards, from {latest} ns to {group.stamp} ns")
                 latest = group.stamp
-                observation = self._reader.read(index, group, messages, images=images)
+                observation = self._reader.read(index, group, messages, images=index in with_images)
             except RecordingError as failure:
                 self.skipped.append((index, str(failure)))
                 continue

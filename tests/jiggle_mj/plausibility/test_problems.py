@@ -157,7 +157,7 @@ def test_what_may_be_wrong_is_doubted_and_not_refused(tmp_path, mistake, doubted
 def test_a_camera_that_cannot_see_the_tool_is_refused(tmp_path, baseline, depth, refuses):
     """The camera looks along the world's z from the height 0; the tool is at `depth` [m]."""
     camera = StereoCamera.rectified(width=32, height=24, focal=40.0, baseline=baseline, T_world_camera=np.eye(4))
-    black = StereoPair(left=np.zeros((24, 32, 3), np.uint8), right=np.zeros((24, 32, 3), np.uint8))
+    left, right = np.random.default_rng(2).integers(0, 256, (2, 24, 32, 3), dtype=np.uint8)
     frames = [
         Observation(
             index=k,
@@ -165,7 +165,7 @@ def test_a_camera_that_cannot_see_the_tool_is_refused(tmp_path, baseline, depth,
             tool=ToolState(
                 position=np.array([0, 0, depth + 0.01 * k]), quat_wxyz=IDENTITY_WXYZ, closed=True, grasp=1, radius=2e-3
             ),
-            images=black,
+            images=StereoPair(left=left, right=right),
         )
         for k in range(3)
     ]
