@@ -20,7 +20,7 @@ from mcap.records import Channel, Message, Schema
 from ...errors import RecordingError
 from ...recording.mcap_files import iterate_records
 from .bag_paths import bag_files, refuse_cut_database, refusing
-from .ros1_chunks import bound_chunks
+from .compression import bound_chunks, decompressed_message, take_messages_compressed
 
 ROS_ENCODINGS = ("cdr", "ros1")
 """Encodings of the messages of ROS 2 and ROS 1."""
@@ -135,7 +135,8 @@ class Bag:
         from rosbags import rosbag1, rosbag2
 
         if file.suffix != ".bag":
-            return _RosbagsFile(self._stack.enter_context(rosbag2.Reader(file)), "cdr")
+            reader = self._stack.enter_context(rosbag2.Reader(file))
+            return _RosbagsFile(reader, "cdr", compressed=take_messages_compressed(reader))
         reader = self._stack.enter_context(rosbag1.Reader(file))
         bound_chunks(reader)
         return _RosbagsFile(reader, "ros1")
@@ -144,8 +145,8 @@ class Bag:
 class _RosbagsFile:
     """A bag that rosbags reads: a ROS 1 file, or a ROS 2 folder or sqlite3 file."""
 
-    def __init__(self, reader: Any, encoding: str) -> None:
-        self._reader, self._encoding = reader, encoding
+    def __init__(self, reader: Any, encoding: str, *, compressed: bool = False) -> None:
+        self._reader, self._encoding, self._compressed = reader, encoding, compressed
 
     def topics(self) -> Iterator[BagTopic]:
         """Yield the topics; one that several publishers share comes once for each."""
@@ -164,7 +165,7 @@ class _RosbagsFile:
         wanted = [connection for connection in self._reader.connections if connection.topic in names]
         if wanted:
             for connection, received, data in self._reader.messages(connections=wanted):
-                yield connection.topic, received, data
+                yield connection.topic, received, decompressed_message(data) if self._compressed else data
 
 
 class _McapFile:

@@ -9,7 +9,6 @@ from rosbags.rosbag1 import Writer as Writer1
 
 from jiggle_mj import Recording
 from jiggle_mj.errors import OutputError, RecordingError
-from jiggle_mj.importing.bags import ros1_chunks
 from jiggle_mj.importing.bags.bag_file import Bag
 from jiggle_mj.importing.bags.bag_paths import is_bag
 from jiggle_mj.importing.bags.gripper import ClosedRule
@@ -26,6 +25,7 @@ from tests.support.robot_bags import (
     write_tool,
 )
 
+LIMIT = "jiggle_mj.importing.bags.compression.MAX_CHUNK_BYTES"
 KINDS = ("ros1", "mcap", "mcap-zstd", "sqlite3", "sqlite3-message", "sqlite3-file")
 
 
@@ -56,9 +56,17 @@ def test_the_chunks_of_a_compressed_ros_1_bag_are_bounded(tmp_path: Path, monkey
         write_tool(made)
     import_bag(made.path, tmp_path / "run.mcap", BagSettings(closed=ClosedRule.parse("always")))
     assert len(list(Recording.open(tmp_path / "run.mcap"))) == 4
-    monkeypatch.setattr(ros1_chunks, "MAX_CHUNK_BYTES", 10_000)
+    monkeypatch.setattr(LIMIT, 10_000)
     with pytest.raises(RecordingError, match="more than 10000 bytes once decompressed"):
         import_bag(made.path, tmp_path / "other.mcap", BagSettings(closed=ClosedRule.parse("always")))
+
+
+def test_the_messages_of_a_compressed_ros_2_bag_are_bounded(tmp_path: Path, monkeypatch):
+    """An image of 32x24 pixels has 2304 bytes."""
+    path = small_bag(tmp_path / "bag", "sqlite3-message")
+    monkeypatch.setattr(LIMIT, 2000)
+    with pytest.raises(RecordingError, match="a message of the bag has more than 2000 bytes once decompressed"):
+        import_bag(path, tmp_path / "run.mcap")
 
 
 def test_the_bytes_depend_on_the_content_alone(tmp_path: Path):
