@@ -20,15 +20,17 @@ from mcap.records import Metadata
 from jiggle_mj.options import SENSING, Sensing
 from jiggle_mj.scenes import Reference, Scene, programme
 
-from .argument_checks import as_choice, as_instance, as_integer, as_path
+from .argument_checks import as_choice, as_instance, as_integer, as_path, quoted
 from .cluster import died_with_its_worker
 from .episode import check_directory, clear_directory, observe, recording_identity
-from .errors import OutputError, RecordingError, SimulationError
+from .errors import OptionError, OutputError, RecordingError, SimulationError
 from .recording.declaration import METADATA
 from .recording.mcap_files import iterate_records, truth_path
 from .recording.truth import salt
 from .worker_processes import WorkerProcesses
 
+MAX_RECORDINGS = 100_000
+"""Most recordings of one series: of some MB each they fill a disk."""
 TRIES = 3
 """How many workers may die at a recording before it is given up."""
 CANCELLED = "its executor cancelled it, because it was stopped or lost its scheduler"
@@ -94,7 +96,8 @@ def record_series(
         The recordings that exist, and the reasons for those that failed.
 
     Raises:
-        OptionError: fewer than one recording, a seed below 0, or an argument of another type.
+        OptionError: fewer than one recording or more than `MAX_RECORDINGS`, a seed below 0, or an argument of another
+            type.
         OutputError: the folder cannot be used, or holds other recordings under these names.
         JiggleError: every recording would fail: the scene is impossible, no OpenGL. Complete recordings stay.
         KeyboardInterrupt: recordings that have not begun are cancelled; complete ones stay.
@@ -102,6 +105,11 @@ def record_series(
     as_instance(scene, "scene", Scene, hint="load_scene(NAME) reads one.")
     as_choice(sensing, "sensing", SENSING)
     folder = as_path(folder, "folder")
+    if as_integer(count, "count", at_least=1) > MAX_RECORDINGS:
+        raise OptionError(
+            f"count = {quoted(count)}: at most {MAX_RECORDINGS} recordings are made; give another --seed for "
+            "further ones."
+        )
     count, seed = as_integer(count, "count", at_least=1), as_integer(seed, "seed", at_least=0)
     if executor is not None:
         as_instance(executor, "executor", Executor, hint="WorkerProcesses() is one.")

@@ -95,6 +95,7 @@ def test_overwrite_replaces_another_scene(scene, one_by_one, tmp_path):
     ("options", "message"),
     [
         ({"count": 0}, "count = 0: must be an integer of at least 1"),
+        ({"count": 10**12}, "at most 100000 recordings are made"),
         ({"seed": -1}, "seed = -1: must be an integer of at least 0"),
     ],
 )
