@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ..errors import OptionError
+from ..recording.pairing import MAX_PAIRING_TOLERANCE_MS
 
 PathArgument = Annotated[Path, tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
@@ -16,8 +17,6 @@ AsJson = Annotated[bool, tyro.conf.arg(name="json")]
 Disturb = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[=MAGNITUDE]")]]
 PAIRING_TOLERANCE_MS = 5.0
 """Largest difference of the stamps of one frame if none is given [ms]; a robot's sensors stamp a few ms apart."""
-MAX_PAIRING_TOLERANCE_MS = 1000.0
-"""Largest one: in a second, every tissue has moved."""
 
 
 def in_ns(tolerance_ms: float) -> int:

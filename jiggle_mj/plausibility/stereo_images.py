@@ -88,7 +88,7 @@ def compare_images(camera: StereoCamera, pairs: Iterable[tuple[StereoPair, Stere
     if len(of_all) < MIN_MATCHES or spread > MAX_ROW_SPREAD * height:
         of_all = np.empty((0, 2))
     offset = float(np.median(of_all[:, 1])) if len(of_all) else 0.0
-    late = [
+    late: list[Side] = [
         side for side, rows in zip(SIDES, (offset, -offset), strict=True) if _shows_earlier(moved[side], offset=rows)
     ]
     return StereoImages(

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median_low
 
+MAX_PAIRING_TOLERANCE_MS = 1000.0
+"""Largest difference between the stamps of one frame that may be allowed [ms]: in a second, every tissue has moved."""
 MAX_LEAP_NS = 60_000_000_000
 """Leap of one time stamp ahead of the next one that is a fault of the stamp [ns]: a minute."""
 

@@ -27,7 +27,7 @@ from ..toml_kinds import MAX_COUNT
 from .contents import RecordingContents
 from .frames import transform_of_rotation
 from .images import decode_image, refuse_other_size
-from .pairing import MessageGroup, Stamped, group_messages, lone_jumps, stamp_gap
+from .pairing import MAX_PAIRING_TOLERANCE_MS, MessageGroup, Stamped, group_messages, lone_jumps, stamp_gap
 from .schemas import parse_calibration, parse_points, parse_transform
 from .stored_arrays import MAX_LENGTH_M, StoredArrays
 from .topics import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO
@@ -286,13 +286,15 @@ def _refuse_unpaired(contents: RecordingContents, groups: list[MessageGroup], to
         return
     gap = stamp_gap(left, right)
     apart, side = abs(gap.median) / 1e6, "later" if gap.median > 0 else "earlier"
-    if gap.within_frame:
+    wanted = math.ceil(apart) + 1
+    if gap.within_frame and wanted <= MAX_PAIRING_TOLERANCE_MS:
         cure = (
-            f"if the cameras do fire together, read it with --pairing-tolerance {math.ceil(apart) + 1} "
-            f"(tolerance_ns={math.ceil(apart) + 1}_000_000)"
+            f"if the cameras do fire together, read it with --pairing-tolerance {wanted} "
+            f"(tolerance_ns={wanted}_000_000)"
         )
     else:
-        cure = f"left images come every {gap.period / 1e6:g} ms: are the two stamps of one clock?"
+        often = f"left images come every {gap.period / 1e6:g} ms" if gap.period else "there is one left image"
+        cure = f"{often}, and at most {MAX_PAIRING_TOLERANCE_MS:g} ms can be allowed: are the two stamps of one clock?"
     raise RecordingError(
         f"{contents.path} has {len(left)} left and {len(right)} right images and no pair within "
         f"{tolerance_ns / 1e6:g} ms: the nearest right image comes {apart:.6g} ms {side} (median); {cure}."

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Int
 
 from ...errors import RecordingError
+from ...recording.pairing import MAX_PAIRING_TOLERANCE_MS
 from .settings import MS
 
 
@@ -60,7 +61,7 @@ def pair_images(left: Sequence[int], right: Sequence[int], tolerance_ms: float) 
         wanted = np.ceil(np.abs(nearest).max() + 1)
         cure = (
             f"--pairing-tolerance {wanted:g} pairs them, if the tissue stands still that long"
-            if wanted * MS < period / 2
+            if wanted * MS < period / 2 and wanted <= MAX_PAIRING_TOLERANCE_MS
             else "no tolerance pairs them without mixing moments: synchronise the cameras, or go by --clock receive"
         )
         raise RecordingError(

@@ -51,8 +51,10 @@ def test_right_images_that_come_late_are_measured_and_can_be_paired(tmp_path):
         in_ns(-1)
 
 
-def test_right_images_of_another_clock_get_no_advice_to_pair_them(tmp_path):
-    path = late_right_images(tmp_path / "clock.mcap", 3600 * 1000 * MS)
+@pytest.mark.parametrize(("late", "period"), [(3600_000, 100), (1200, 5000)])
+def test_right_images_further_away_than_may_be_paired_get_no_advice_to_pair_them(tmp_path, late: int, period: int):
+    """By an hour, or by 1.2 s of 5 s from frame to frame, where at most 1 s may be allowed; in ms."""
+    path = late_right_images(tmp_path / "clock.mcap", late * MS, period * MS)
     with pytest.raises(RecordingError, match="are the two stamps of one clock") as refused:
         Recording.open(path)
     assert "--pairing-tolerance" not in str(refused.value)

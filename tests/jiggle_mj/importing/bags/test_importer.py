@@ -64,6 +64,11 @@ def test_late_right_images_are_paired_only_when_the_user_says_so(tmp_path: Path)
     assert any("right minus left 8 ms (from 8 to 8 ms)" in note for note in summary.notes)
 
 
+def test_right_images_further_away_than_may_be_paired_get_no_advice_to_pair_them(tmp_path: Path):
+    """One frame, 1.2 s late: no time from frame to frame bounds the tolerance."""
+    assert "no tolerance pairs them" in refused(small_bag(tmp_path / "bag", n=1, late=1200 * MS))
+
+
 def test_images_of_another_moment_are_never_paired(tmp_path: Path):
     """Right images 40 ms late at 100 ms a frame pair at 45 ms; 60 ms could reach the next frame."""
     path = small_bag(tmp_path / "bag", late=40 * MS)
