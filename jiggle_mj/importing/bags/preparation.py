@@ -1,7 +1,6 @@
 """All that an import knows before it reads the first image: camera, tool, jaws, frames and what to say about them."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -9,13 +8,14 @@ from ...camera import CameraCalibration, StereoCamera
 from ...errors import RecordingError
 from ...observation import Declaration, MeasuredPoints
 from ...recording.force import ToolForce
+from .bag_camera import bag_camera
 from .bag_file import Bag
 from .bag_paths import listed
-from .calibration import CameraSource, parse_camera_info, read_camera_file, stereo_camera
+from .calibration import parse_camera_info
 from .gripper import ALWAYS, JawState, jaw_states, jaw_value
 from .missing import missing_roles
-from .roles import RoleChoice, is_rectified
-from .settings import MS, BagSettings, Role, Side
+from .roles import RoleChoice
+from .settings import MS, BagSettings, Role
 from .stamps import refuse_apart
 from .stereo_pairs import pair_images
 from .survey import BagSurvey, survey_bag
@@ -96,9 +96,10 @@ def prepare(
     notes = list(survey.notes)
     main: Role = "left" if stereo else "points" if "points" in roles else "depth"
     world, declaration = _world(survey, main, settings, notes)
+    tool = _tool(survey, roles, world, notes)
     camera, order_unsure = None, False
     if stereo:
-        camera, order_unsure = _camera(bag, survey, roles, settings, world, notes)
+        camera, order_unsure = bag_camera(bag, survey, roles, settings, world, tool, notes)
     depth = None
     if main == "depth":
         info = survey.messages["depth_info"][0]
@@ -110,7 +111,6 @@ def prepare(
         )
     frames = _frames(survey, main, settings, notes)
     stamps = [frame.stamp for frame in frames]
-    tool = _tool(survey, roles, world, notes)
     refuse_apart(stamps, roles[main].topic, tool.times.tolist(), roles["tool"].topic)
     return Preparation(
         settings=settings,
@@ -140,63 +140,6 @@ def _world(survey: BagSurvey, main: Role, settings: BagSettings, notes: list[str
         return world, replace(Declaration(), gravity=(0.0, 0.0, 0.0), bed=False)
     notes.append(f"the world is the frame '{world}', z up")
     return world, settings.declaration or Declaration()
-
-
-def _camera(
-    bag: Bag,
-    survey: BagSurvey,
-    roles: dict[Role, RoleChoice],
-    settings: BagSettings,
-    world: str,
-    notes: list[str],
-) -> tuple[StereoCamera, bool]:
-    sources: dict[Role, CameraSource] = {}
-    sides: tuple[tuple[Side, Role], ...] = (("left", "left_info"), ("right", "right_info"))
-    for side, info in sides:
-        frame = survey.frame[side]
-        if side in settings.camera_info:
-            sources[side] = read_camera_file(settings.camera_info[side], frame)
-            continue
-        messages, where = survey.messages[info], roles[info].topic
-        sources[side] = parse_camera_info(messages[0], where, frame or survey.frame[info])
-        if any(not _same_info(messages[0], other) for other in messages[1:]):
-            notes.append(f"{where} changes during the bag (zoom or focus?); its first message is used")
-    left, right, tree = sources["left"].frame, sources["right"].frame, survey.tree
-    stamp = min(survey.times["left"].stamps)
-    where = roles["left"].topic
-    if left and left != world:
-        for name, motion in tree.moving(left, world):
-            raise RecordingError(
-                f"{bag.path}: the camera moves: '{name}' strays by {1e3 * motion.distance:.3g} mm and "
-                f"{np.degrees(motion.angle):.3g} degrees from its mean on /tf; a camera that stands still is read. "
-                "Import a part of the bag in which it stands still, or name a frame that moves with the tissue with "
-                "--world."
-            )
-    T_world_left = tree.T_world(left or world, world, stamp, where)
-    T_left_right = None
-    if left and right and left != right and left in tree.names and right in tree.names:
-        if tree.root(left) == tree.root(right):
-            root = tree.root(left)
-            T_left_right = np.linalg.inv(tree.T_world(left, root, stamp, where)) @ tree.T_world(
-                right, root, stamp, where
-            )
-    rectified = is_rectified(where) if settings.rectified is None else settings.rectified
-    camera, unsure, said = stereo_camera(
-        sources["left"],
-        sources["right"],
-        T_world_left=T_world_left,
-        T_left_right=T_left_right,
-        rectified=rectified,
-    )
-    raw = "rectified" if rectified else "raw"
-    notes += [*said, f"{camera.left.width}x{camera.left.height} {raw} images, baseline {1e3 * camera.baseline:.4g} mm"]
-    return camera, unsure
-
-
-def _same_info(first: Any, other: Any) -> bool:
-    """Return whether two CameraInfo messages have the same matrices."""
-    names = ("k", "d", "r", "p") if hasattr(first, "k") else ("K", "D", "R", "P")
-    return all(np.array_equal(getattr(first, name), getattr(other, name)) for name in names)
 
 
 def _frames(survey: BagSurvey, main: Role, settings: BagSettings, notes: list[str]) -> list[FrameParts]:

@@ -67,23 +67,8 @@ class ToolTrack:
         Raises:
             RecordingError: /tf does not join the frame to the world, or it does not move.
         """
-        name = frame_name(name)
-        moving = [each for each, _ in tree.moving(name, world)]
-        if not moving:
-            raise RecordingError(f"the tool's frame '{name}' does not move on /tf; is it the right frame?")
-        found: list[tuple[int, np.ndarray, np.ndarray]] = []
-        dropped = 0
-        for time in np.unique(np.concatenate([tree.track(each).times for each in moving])).tolist():
-            try:
-                T = tree.T_world(name, world, time, f"the tool 'tf:{name}'")
-            except RecordingError:
-                dropped += 1
-                continue
-            quat = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
-            found.append((time, T[:3, 3].copy(), quat))
-        if not found:
-            raise RecordingError(f"/tf never joins the tool's frame '{name}' to '{world}' at one time.")
-        return cls._of(found, dropped)
+        track, dropped = tree.over_time(frame_name(name), world, f"the tool 'tf:{name}'")
+        return cls(times=track.times, positions=track.positions, quats_wxyz=track.quats_wxyz, n_dropped=dropped)
 
     @classmethod
     def _of(cls, found: list[tuple[int, np.ndarray, np.ndarray]], dropped: int) -> Self:

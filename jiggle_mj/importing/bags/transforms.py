@@ -70,6 +70,17 @@ class FrameTrack:
         distances = np.linalg.norm(self.positions - mean[:3, 3], axis=1)
         return FrameMotion(distance=float(distances.max()), angle=float(rotations.magnitude().max()))
 
+    def stray(self, place: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " n"]:
+        """Return how far each pose moves a place from where the mean pose has it [m].
+
+        Args:
+            place: in the parent [m].
+        """
+        T = self.mean()
+        inside = T[:3, :3].T @ (place - T[:3, 3])
+        moved = Rotation.from_quat(self.quats_wxyz, scalar_first=True).apply(inside) + self.positions
+        return np.linalg.norm(moved - place, axis=1)
+
     def at(self, time: int, name: str) -> Float[np.ndarray, "4 4"]:
         """Return the pose at a time [ns], interpolated between the two nearest messages.
 
@@ -160,6 +171,34 @@ class TransformTree:
         chain = self._chain(name, world, "/tf")
         motions = [(each, self.track(each).motion()) for each in chain]
         return [(each, motion) for each, motion in motions if not motion.still]
+
+    def over_time(self, name: str, world: str, where: str) -> tuple[FrameTrack, int]:
+        """Return the poses of a frame in the world at each message of a moving frame between them.
+
+        The number is that of messages at which another moving frame between them has no pose.
+
+        Raises:
+            RecordingError: /tf does not join them, or no frame between them moves.
+        """
+        times = [self.track(each).times for each, _ in self.moving(name, world)]
+        poses: dict[int, Float[np.ndarray, "4 4"]] = {}
+        failure = RecordingError(f"{where}: its frame '{name}' does not move on /tf; is it the right frame?")
+        every = np.unique(np.concatenate([*times, np.empty(0, np.int64)])).tolist()
+        for time in every:
+            try:
+                poses[time] = self.T_world(name, world, time, where)
+            except RecordingError as reason:
+                failure = reason
+        if not poses:
+            raise failure
+        T = np.array(list(poses.values()))
+        track = FrameTrack(
+            parent=world,
+            times=np.array(list(poses), np.int64),
+            positions=T[:, :3, 3],
+            quats_wxyz=Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=True),
+        )
+        return track, len(every) - len(poses)
 
     def T_world(self, name: str, world: str, time: int, where: str) -> Float[np.ndarray, "4 4"]:
         """Return the pose of a frame in the world at a time [ns].
