@@ -22,8 +22,14 @@ COLOURS = {name: (channels, TO_RGB.get(name)) for name, (value, channels) in RAW
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
 """Encodings of 8 bits: bytes of a pixel, and OpenCV's conversion to RGB, None for none: a recording's, and YUV."""
-DEEP = {"mono16": "mono8", "16UC1": "mono8", "rgb16": "rgb8", "bgr16": "bgr8", "rgba16": "rgba8", "bgra16": "bgra8"} | {
-    f"bayer_{pattern}16": f"bayer_{pattern}8" for pattern in ("rggb", "bggr", "gbrg", "grbg")
+DEEP = {
+    "mono16": "mono8",
+    "rgb16": "rgb8",
+    "bgr16": "bgr8",
+    "rgba16": "rgba8",
+    "bgra16": "bgra8",
+    **{f"16UC{channels}": f"8UC{channels}" for channels in (1, 3, 4)},
+    **{f"bayer_{pattern}16": f"bayer_{pattern}8" for pattern in ("rggb", "bggr", "gbrg", "grbg")},
 }
 """Encodings of 16 bits, and those of 8 bits that their upper bytes have."""
 DEPTHS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}

@@ -170,8 +170,12 @@ def _tool(survey: BagSurvey, roles: dict[Role, RoleChoice], world: str, notes: l
         tool = ToolTrack.from_frame(frame, survey.tree, world)
     else:
         tool = ToolTrack.from_messages(survey.messages["tool"], survey.times["tool"], survey.tree, world)
+    topic = roles["tool"].topic
     if tool.n_dropped:
-        notes.append(f"{roles['tool'].topic}: {tool.n_dropped} poses are left out: NaN, or not joined to '{world}'")
+        why = tool.why_dropped or f"not joined to '{world}' at their time"
+        notes.append(f"{topic}: {tool.n_dropped} poses are left out: {why}")
+    if not tool.rotates:
+        notes.append(f"{topic}: no pose has an orientation (all quaternions are 0), so the tool does not rotate")
     return tool
 
 

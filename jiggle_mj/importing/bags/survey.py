@@ -83,6 +83,7 @@ def survey_bag(bag: Bag, roles: dict[Role, RoleChoice], settings: BagSettings) -
         if n_twice and not name.endswith("camera_info"):
             notes.append(f"{name}: {n_twice} messages have the stamp of an earlier one and are left out")
         times |= {role: of_topic for role in its_roles}
+    notes += tree.left_out()
     clocked = [each for role, each in times.items() if role not in ("left_info", "right_info", "depth_info")]
     refuse_two_clocks(clocked)
     return BagSurvey(times=times, messages=messages, frame=frame, tree=tree, notes=notes)

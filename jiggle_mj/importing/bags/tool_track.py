@@ -5,6 +5,7 @@ are kept for the recording.
 """
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, Self
 
 import numpy as np
@@ -20,6 +21,8 @@ from .transforms import TransformTree, frame_name, parse_ros_pose
 
 MAX_REPORT_AGE = 100_000_000
 """Longest time from a report to a frame that it speaks for [ns]; twice that between two reports around it."""
+NO_ROTATION = SimpleNamespace(w=1.0, x=0.0, y=0.0, z=0.0)
+"""Orientation of a tool whose reports have none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +37,10 @@ class ToolTrack:
     """Orientations in the world."""
     n_dropped: int
     """Number of reports that are no pose, or whose frame /tf does not know at their time."""
+    why_dropped: str = ""
+    """Why the last of them was; empty where nothing says it."""
+    rotates: bool = True
+    """Whether the reports have orientations; else the tool keeps that of their frame."""
 
     @classmethod
     def from_messages(cls, messages: list[Any], times: TopicTimes, tree: TransformTree, world: str) -> Self:
@@ -44,13 +51,12 @@ class ToolTrack:
         """
         found: list[tuple[int, np.ndarray, np.ndarray]] = []
         failure, dropped = None, 0
+        parts = [_parts(message) for message in messages]
+        rotates = any(any((rotation.w, rotation.x, rotation.y, rotation.z)) for _, rotation in parts)
         for number in times.order:
-            message, stamp = messages[number], times.stamps[number]
+            message, stamp, (position, rotation) = messages[number], times.stamps[number], parts[number]
             try:
-                if hasattr(message, "pose"):
-                    pose = parse_ros_pose(message.pose.position, message.pose.orientation, times.topic)
-                else:
-                    pose = parse_ros_pose(message.transform.translation, message.transform.rotation, times.topic)
+                pose = parse_ros_pose(position, rotation if rotates else NO_ROTATION, times.topic)
                 T = tree.T_world(frame_name(message.header.frame_id) or world, world, stamp, times.topic)
             except RecordingError as reason:
                 failure, dropped = reason, dropped + 1
@@ -58,7 +64,15 @@ class ToolTrack:
             found.append((stamp, *_in_world(T, *pose)))
         if not found:
             raise failure or RecordingError(f"{times.topic} holds no pose.")
-        return cls._of(found, dropped)
+        stamps, positions, quats = zip(*found, strict=True)
+        return cls(
+            times=np.array(stamps, np.int64),
+            positions=np.array(positions),
+            quats_wxyz=np.array(quats),
+            n_dropped=dropped,
+            why_dropped=str(failure or ""),
+            rotates=rotates,
+        )
 
     @classmethod
     def from_frame(cls, name: str, tree: TransformTree, world: str) -> Self:
@@ -69,16 +83,6 @@ class ToolTrack:
         """
         track, dropped = tree.over_time(frame_name(name), world, f"the tool 'tf:{name}'")
         return cls(times=track.times, positions=track.positions, quats_wxyz=track.quats_wxyz, n_dropped=dropped)
-
-    @classmethod
-    def _of(cls, found: list[tuple[int, np.ndarray, np.ndarray]], dropped: int) -> Self:
-        times, positions, quats = zip(*found, strict=True)
-        return cls(
-            times=np.array(times, np.int64),
-            positions=np.array(positions),
-            quats_wxyz=np.array(quats),
-            n_dropped=dropped,
-        )
 
     def at(self, time: int) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 4"]]:
         """Return position [m] and orientation wxyz at a time [ns].
@@ -108,6 +112,13 @@ class ToolTrack:
             ToolReport(time=int(time) - origin, position=position)
             for time, position in zip(self.times[inside], self.positions[inside], strict=True)
         )
+
+
+def _parts(message: Any) -> tuple[Any, Any]:
+    """Return position and orientation of a `PoseStamped` or `TransformStamped`."""
+    if hasattr(message, "pose"):
+        return message.pose.position, message.pose.orientation
+    return message.transform.translation, message.transform.rotation
 
 
 def _in_world(

@@ -115,12 +115,13 @@ class TransformTree:
         self._parents: dict[str, str] = {}
         self._tracks: dict[str, FrameTrack] = {}
         self._means: dict[str, Float[np.ndarray, "4 4"] | None] = {}
+        self._refused: dict[str, list[str]] = {}
 
     def add(self, transform: Any, time: int) -> None:
-        """Add one `geometry_msgs/TransformStamped` at a time [ns].
+        """Add one `geometry_msgs/TransformStamped` at a time [ns]; one that is no pose is left out, as tf2 does.
 
         Raises:
-            RecordingError: a frame with two parents, NaN, or a quaternion that is not of unit length.
+            RecordingError: a frame with two parents.
         """
         child, parent = frame_name(transform.child_frame_id), frame_name(transform.header.frame_id)
         known = self._parents.setdefault(child, parent)
@@ -129,10 +130,16 @@ class TransformTree:
                 f"/tf gives the frame '{child}' two parents, '{known}' and '{parent}'; a frame has one. Record without "
                 "one of the two publishers."
             )
-        position, quat_wxyz = parse_ros_pose(
-            transform.transform.translation, transform.transform.rotation, f"/tf of '{child}'"
-        )
-        self._samples.setdefault(child, []).append((time, position, quat_wxyz))
+        try:
+            pose = parse_ros_pose(transform.transform.translation, transform.transform.rotation, f"/tf of '{child}'")
+        except RecordingError as failure:
+            self._refused.setdefault(child, []).append(str(failure))
+            return
+        self._samples.setdefault(child, []).append((time, *pose))
+
+    def left_out(self) -> list[str]:
+        """Return what was left out, one sentence for each frame."""
+        return [f"{reasons[0]}; {len(reasons)} such messages are left out" for reasons in self._refused.values()]
 
     @property
     def names(self) -> set[str]:
@@ -154,8 +161,14 @@ class TransformTree:
         return name
 
     def track(self, name: str) -> FrameTrack:
-        """Return the poses of a frame that /tf names, by time; of two at one time the first."""
+        """Return the poses of a frame that /tf names, by time; of two at one time the first.
+
+        Raises:
+            RecordingError: all of its messages were left out.
+        """
         if name not in self._tracks:
+            if name not in self._samples:
+                raise RecordingError(f"{self._refused[name][0]}; so are all its messages.")
             samples = sorted(self._samples[name], key=lambda sample: sample[0])
             times, first = np.unique(np.array([time for time, _, _ in samples], np.int64), return_index=True)
             self._tracks[name] = FrameTrack(
@@ -243,16 +256,16 @@ def frame_name(name: str) -> str:
 def parse_ros_pose(
     position: Any, orientation: Any, where: str
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 4"]]:
-    """Return position [m] and quaternion wxyz of a ROS pose or transform; an all-zero quaternion is the identity.
+    """Return position [m] and quaternion wxyz of a ROS pose or transform.
 
     Raises:
-        RecordingError: NaN, or a quaternion that is not of unit length.
+        RecordingError: NaN, or a quaternion that is zero or not of unit length.
     """
     xyz = np.array([position.x, position.y, position.z], float)
     wxyz = np.array([orientation.w, orientation.x, orientation.y, orientation.z], float)
-    if not wxyz.any():
-        wxyz = np.array([1.0, 0.0, 0.0, 0.0])
     try:
+        if not wxyz.any():
+            raise RecordingError("the rotation is not set: all of its quaternion is 0 (w = 1 is no rotation)")
         if np.abs(xyz).max() > MAX_DISTANCE or np.abs(wxyz).max() > 2:
             raise RecordingError(f"position {xyz.tolist()} m, quaternion wxyz {wxyz.tolist()} is no pose")
         refuse_bad_pose(xyz, wxyz)

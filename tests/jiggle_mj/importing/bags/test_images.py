@@ -38,9 +38,10 @@ def test_a_fourth_channel_is_dropped(encoding: str, order: list[int]):
     np.testing.assert_array_equal(rgb_image(message(encoding, four)), picture())
 
 
-def test_grey_is_three_equal_channels():
+@pytest.mark.parametrize("encoding", ("mono8", "8UC1"))
+def test_grey_is_three_equal_channels(encoding: str):
     grey = picture()[..., 0]
-    np.testing.assert_array_equal(rgb_image(message("mono8", grey)), np.repeat(grey[..., None], 3, axis=2))
+    np.testing.assert_array_equal(rgb_image(message(encoding, grey)), np.repeat(grey[..., None], 3, axis=2))
 
 
 @pytest.mark.parametrize("pattern", ("rggb", "bggr", "gbrg", "grbg"))
@@ -60,6 +61,12 @@ def test_sixteen_bits_are_read_in_the_order_of_the_header(order: str):
     grey = np.random.default_rng(1).integers(0, 2**16, (4, 5)).astype(np.uint16)
     image = rgb_image(message("mono16", grey.astype(f"{order}u2"), is_bigendian=order == ">"))
     np.testing.assert_array_equal(image[..., 0], grey >> 8)
+
+
+@pytest.mark.parametrize(("encoding", "channels"), [("16UC3", 3), ("bgr16", 3), ("16UC4", 4)])
+def test_sixteen_bits_without_a_name_for_their_colours_are_bgr_as_in_opencv(encoding: str, channels: int):
+    deep = np.random.default_rng(1).integers(0, 2**16, (4, 5, channels)).astype("<u2")
+    np.testing.assert_array_equal(rgb_image(message(encoding, deep)), deep[..., 2::-1] >> 8)
 
 
 def test_padding_at_the_end_of_rows_is_dropped():

@@ -166,6 +166,47 @@ def test_a_camera_that_moves_what_it_sees_at_the_tool_is_refused(
     assert f"the camera moves on /tf (left_optical): at the tool's place it strays by {says}" in why
 
 
+def test_quaternions_that_are_no_rotation_are_left_out_and_said(tmp_path: Path):
+    """Quaternions of zeros in all poses of the tool mean that it has no orientation; elsewhere they mean nothing."""
+
+    def tool(quats: list) -> Callable[[RobotBag], None]:
+        def write(made: RobotBag) -> None:
+            for index, quat in enumerate(quats):
+                made.pose("/tool/pose", index * STEP, [1e-3 * index, 0, 0], quat)
+                made.write("/gripper/closed", index * STEP, "std_msgs/Bool", data=True)
+
+        return write
+
+    def all_infos(made: RobotBag) -> None:
+        made.info("/left/camera_info", 0, small_camera().left)
+        made.info("/right/camera_info", 0, small_camera().right)
+
+    def frames(*quats: tuple) -> Callable[[RobotBag], None]:
+        def write(made: RobotBag) -> None:
+            for index, (w, x, y, z) in enumerate(quats):
+                sent = made.transform("world", "left_optical", index * STEP, small_camera().T_world_camera)
+                sent.transform.rotation.w, sent.transform.rotation.x = w, x
+                sent.transform.rotation.y, sent.transform.rotation.z = y, z
+                made.tf("/tf", index * STEP, sent)
+
+        return write
+
+    zero, one, down, long = (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (2, 0, 0, 0)
+    for name in ("none", "some", "tf", "long"):
+        (tmp_path / name).mkdir()
+    summary, recording = imported(bag(tmp_path / "none", cameras, write_images, tool([zero] * 4)))
+    assert len(list(recording)) == 4 and any("no pose has an orientation" in note for note in summary.notes)
+    summary, recording = imported(bag(tmp_path / "some", cameras, write_images, tool([one, zero, one, one])))
+    assert any("1 poses are left out: /tool/pose: the rotation is not set" in note for note in summary.notes)
+    summary, recording = imported(
+        bag(tmp_path / "tf", all_infos, frames(zero, down, long, down), write_tool, write_images)
+    )
+    np.testing.assert_allclose(recording.camera.T_world_camera, small_camera().T_world_camera, atol=1e-9)
+    assert any("/tf of 'left_optical': the rotation is not set" in note for note in summary.notes)
+    why = refused(bag(tmp_path / "long", all_infos, frames(long), write_tool, write_images))
+    assert "/tf of 'left_optical'" in why and "is not of unit length; so are all its messages" in why
+
+
 def test_the_tool_may_be_a_frame_of_tf(tmp_path: Path):
     """On an arm that turns by 90 degrees in 200 ms, seen every 100 ms: interpolated between."""
 

@@ -84,6 +84,11 @@ def test_a_circle_and_two_parents_are_refused():
         tree((0, transform("a", "b")), (0, transform("c", "b")))
 
 
-def test_a_transform_that_is_none_is_refused():
-    with pytest.raises(RecordingError, match="/tf of 'tip': NaN"):
-        tree((0, transform("world", "tip", (np.nan, 0, 0))))
+def test_a_transform_that_is_none_is_left_out_and_a_frame_without_others_refused():
+    none, good = transform("world", "tip", (np.nan, 0, 0)), transform("world", "tip", (1, 0, 0))
+    made = tree((0, none), (5, good))
+    np.testing.assert_array_equal(made.T_world("tip", "world", 5, "/points")[:3, 3], [1, 0, 0])
+    (said,) = made.left_out()
+    assert said.startswith("/tf of 'tip': NaN") and said.endswith("; 1 such messages are left out")
+    with pytest.raises(RecordingError, match=r"/tf of 'tip': NaN.*so are all its messages"):
+        tree((0, none)).T_world("tip", "world", 0, "/points")
