@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from ...camera import StereoCamera
 from ...errors import OutputError, RecordingError
 from ...observation import MeasuredPoints, Observation, StereoPair, ToolState
 from ...recording.declaration import identity
@@ -25,7 +24,7 @@ from ..complete_files import complete_files
 from ..grasp_table import DEFAULT_GRASP_RADIUS
 from .bag_file import Bag
 from .bag_paths import refusing
-from .camera_order import left_is_left
+from .camera_order import disparities, left_is_left, scene_range
 from .clouds import cloud_points, depth_points
 from .gripper import state_at
 from .images import rgb_image
@@ -95,14 +94,14 @@ def _import(bag: Bag, part: Path, out: Path, settings: BagSettings) -> BagSummar
     roles, unsure = choose_roles(bag.topics, settings.topics)
     prepared = prepare(bag, roles, unsure, settings)
     notes = list(prepared.notes)
-    camera = _checked_camera(bag, prepared, notes)
-    if camera is not None:
-        notes += tool_in_view(camera, prepared)
+    scene = _scene_seen(bag, prepared, notes)
+    if prepared.camera is not None:
+        notes += tool_in_view(prepared.camera, prepared, scene)
     skipped: Counter[str] = Counter()
     written: list[int] = []
     with RecordingWriter(
         part,
-        camera=camera,
+        camera=prepared.camera,
         declaration=prepared.declaration,
         metadata={"source": "ROS bag", "identity": _identity(prepared)},
     ) as writer:
@@ -223,8 +222,8 @@ def _points(prepared: Preparation, stamp: int, read: dict[Role, Any]) -> Measure
     return MeasuredPoints(positions=positions, track_id=track, **known)
 
 
-def _checked_camera(bag: Bag, prepared: Preparation, notes: list[str]) -> StereoCamera | None:
-    """Return the camera after the first pair of images has told whether left is left.
+def _scene_seen(bag: Bag, prepared: Preparation, notes: list[str]) -> tuple[float, float] | None:
+    """Return the range of the disparities in the first pair of images that can be used [px]; None where unknown.
 
     Raises:
         RecordingError: the topics of the cameras are swapped, or nothing tells whether they are.
@@ -236,7 +235,8 @@ def _checked_camera(bag: Bag, prepared: Preparation, notes: list[str]) -> Stereo
             pair = StereoPair(left=_image(prepared, "left", read), right=_image(prepared, "right", read))
         except RecordingError:
             continue
-        right_order = left_is_left(prepared.camera, pair)
+        found = disparities(prepared.camera, pair)
+        right_order = left_is_left(found)
         if right_order is False or (right_order is None and prepared.order_unsure):
             raise RecordingError(
                 f"{bag.path}: {prepared.topic('left')} was taken by the camera on the right"
@@ -245,8 +245,8 @@ def _checked_camera(bag: Bag, prepared: Preparation, notes: list[str]) -> Stereo
             )
         if prepared.order_unsure:
             notes.append("P[0,3] of the right camera has the other sign; the images show which camera is on the left")
-        return prepared.camera
-    return prepared.camera
+        return scene_range(found)
+    return None
 
 
 def _identity(prepared: Preparation) -> str:

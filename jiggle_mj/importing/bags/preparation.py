@@ -96,7 +96,7 @@ def prepare(
     notes = list(survey.notes)
     main: Role = "left" if stereo else "points" if "points" in roles else "depth"
     world, declaration = _world(survey, main, settings, notes)
-    tool = _tool(survey, roles, world, notes)
+    tool = _tool(survey, roles, world, notes).scaled(settings.tool_unit)
     camera, order_unsure = None, False
     if stereo:
         camera, order_unsure = bag_camera(bag, survey, roles, settings, world, tool, notes)

@@ -16,6 +16,7 @@ from ...observation import Declaration
 from ...recording.reader import PAIRING_TOLERANCE_NS
 from ...toml_kinds import StrictTable
 from ..recording_toml import parse_declaration_table
+from ..units import LENGTH_UNITS, unit_of
 from .gripper import ClosedRule
 
 Role = Literal["left", "right", "left_info", "right_info", "tool", "gripper", "points", "depth", "depth_info", "force"]
@@ -56,6 +57,8 @@ class BagSettings:
     """Topic of each role that the user names; `tf:FRAME` for a tool that is a frame of /tf; empty for no topic."""
     closed: ClosedRule | None = None
     """When the jaws are closed; None where the messages say so themselves."""
+    tool_unit: float = 1.0
+    """Metres in one unit of the poses on the tool's topic."""
     grasp_radius: float | None = None
     """Radius of the grip [m]; None for the importer's default, which is said."""
     camera_info: dict[Side, Path] = field(default_factory=dict)
@@ -94,7 +97,7 @@ def read_map(path: Path) -> BagSettings:
         raise RecordingError(f"{path} is not TOML: {str(failure)[:200]}.") from failure
     tables = {
         name: top.table(name, optional=True)
-        for name in ("topics", "gripper", "camera", "time", "frames", "points", "depth", "declaration")
+        for name in ("topics", "tool", "gripper", "camera", "time", "frames", "points", "depth", "declaration")
     }
     topics, gripper, camera, depth = tables["topics"], tables["gripper"], tables["camera"], tables["depth"]
     rule, limits = gripper.take("closed", kinds.text, None), depth.take("range", _range, [0.0, DepthSettings.far])
@@ -102,6 +105,7 @@ def read_map(path: Path) -> BagSettings:
     settings = BagSettings(
         topics={role: topics.take(role, kinds.text) for role in ROLES if role in topics.values},
         closed=None if rule is None else ClosedRule.parse(rule),
+        tool_unit=unit_of(tables["tool"], "unit", LENGTH_UNITS, "m"),
         grasp_radius=gripper.take("radius", kinds.positive, None),
         camera_info={
             side: path.parent / camera.take(side, kinds.text) for side in ("left", "right") if side in camera.values

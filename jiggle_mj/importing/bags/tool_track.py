@@ -4,7 +4,7 @@ Between two reports the position is interpolated linearly and the orientation al
 are kept for the recording.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, Self
 
@@ -35,6 +35,8 @@ class ToolTrack:
     """Positions of the tip in the world [m]."""
     quats_wxyz: Float[np.ndarray, "n 4"]
     """Orientations in the world."""
+    origins: Float[np.ndarray, "n 3"]
+    """Where the origin of each report's own frame is in the world [m]."""
     n_dropped: int
     """Number of reports that are no pose, or whose frame /tf does not know at their time."""
     why_dropped: str = ""
@@ -49,7 +51,7 @@ class ToolTrack:
         Raises:
             RecordingError: no message is a pose that /tf joins to the world.
         """
-        found: list[tuple[int, np.ndarray, np.ndarray]] = []
+        found: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
         failure, dropped = None, 0
         parts = [_parts(message) for message in messages]
         rotates = any(any((rotation.w, rotation.x, rotation.y, rotation.z)) for _, rotation in parts)
@@ -61,14 +63,15 @@ class ToolTrack:
             except RecordingError as reason:
                 failure, dropped = reason, dropped + 1
                 continue
-            found.append((stamp, *_in_world(T, *pose)))
+            found.append((stamp, *_in_world(T, *pose), T[:3, 3].copy()))
         if not found:
             raise failure or RecordingError(f"{times.topic} holds no pose.")
-        stamps, positions, quats = zip(*found, strict=True)
+        stamps, positions, quats, origins = zip(*found, strict=True)
         return cls(
             times=np.array(stamps, np.int64),
             positions=np.array(positions),
             quats_wxyz=np.array(quats),
+            origins=np.array(origins),
             n_dropped=dropped,
             why_dropped=str(failure or ""),
             rotates=rotates,
@@ -82,7 +85,23 @@ class ToolTrack:
             RecordingError: /tf does not join the frame to the world, or it does not move.
         """
         track, dropped = tree.over_time(frame_name(name), world, f"the tool 'tf:{name}'")
-        return cls(times=track.times, positions=track.positions, quats_wxyz=track.quats_wxyz, n_dropped=dropped)
+        return cls(
+            times=track.times,
+            positions=track.positions,
+            quats_wxyz=track.quats_wxyz,
+            origins=track.positions,
+            n_dropped=dropped,
+        )
+
+    def scaled(self, factor: float) -> Self:
+        """Return the track in another unit of the reported positions; /tf is in metres, and a frame of it stays.
+
+        Args:
+            factor: metres in the unit; 1 for none.
+        """
+        if factor == 1:
+            return self
+        return replace(self, positions=self.origins + factor * (self.positions - self.origins))
 
     def at(self, time: int) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 4"]]:
         """Return position [m] and orientation wxyz at a time [ns].

@@ -6,13 +6,13 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
-from jiggle_mj import Recording
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.importing.bags.gripper import ClosedRule
-from jiggle_mj.importing.bags.importer import BagSummary, import_bag
+from jiggle_mj.importing.bags.importer import import_bag
 from jiggle_mj.importing.bags.settings import BagSettings, DepthSettings
 from jiggle_mj.observation import Declaration
 from jiggle_mj.recording.output_files import PartialFile
+from tests.support.bag_imports import bag, cameras, imported, refused
 from tests.support.robot_bags import (
     STEP,
     RobotBag,
@@ -28,32 +28,9 @@ from tests.support.robot_bags import (
 MS = 1_000_000
 
 
-def bag(path: Path, *parts: Callable[[RobotBag], object]) -> Path:
-    with RobotBag(path / "bag") as made:
-        for part in parts:
-            part(made)
-    return made.path
-
-
-def cameras(made: RobotBag) -> None:
-    made.cameras(small_camera())
-
-
 def clouds(made: RobotBag) -> None:
     for index in range(4):
         made.cloud("/tracks", index * STEP, points_table(shift=float(index)))
-
-
-def imported(path: Path, **settings) -> tuple[BagSummary, Recording]:
-    summary = import_bag(path, path.parent / "run.mcap", BagSettings(**settings), overwrite=True)
-    return summary, Recording.open(path.parent / "run.mcap")
-
-
-def refused(path: Path, **settings) -> str:
-    with pytest.raises(RecordingError) as failure:
-        imported(path, **settings)
-    assert not (path.parent / "run.mcap").exists() and "\n" not in str(failure.value)
-    return str(failure.value)
 
 
 def test_late_right_images_are_paired_only_when_the_user_says_so(tmp_path: Path):
@@ -362,23 +339,6 @@ def test_images_of_another_size_than_the_calibration_are_refused(tmp_path: Path)
             made.image(f"/{side}/image_raw", 0, "rgb8", np.zeros((48, 64, 3), np.uint8))
 
     assert "/left/image_raw is 64x48 and its calibration 32x24" in refused(bag(tmp_path, cameras, write_tool, large))
-
-
-def tool_at(*position: float) -> Callable[[RobotBag], None]:
-    def write(made: RobotBag) -> None:
-        for index in range(4):
-            made.pose("/tool/pose", index * STEP, position)
-            made.write("/gripper/closed", index * STEP, "std_msgs/Bool", data=True)
-
-    return write
-
-
-def test_a_tip_that_no_camera_can_see_is_named(tmp_path: Path):
-    """The camera is 0.1 m above the origin and looks down: a tip at 0.5 m is behind it, one at 30 m beside it."""
-    (tmp_path / "beside").mkdir()
-    summary, _ = imported(bag(tmp_path / "beside", cameras, write_images, tool_at(30.0, 0.0, 0.0)))
-    assert any(note.startswith("WARNING: with closed jaws the tip is always far outside") for note in summary.notes)
-    assert "always behind the left camera" in refused(bag(tmp_path, cameras, write_images, tool_at(0.0, 0.0, 0.5)))
 
 
 def test_the_name_of_a_bool_is_taken_at_its_word(tmp_path: Path):
