@@ -1,20 +1,21 @@
 """Whether the camera can see the tool: a wrong frame, unit or order of axes puts the tip where no camera looks.
 
-Where another unit, or the inverse of the camera's pose, puts the tip into the scene, and what is given does not, it is
-named.
+Where another unit, or another meaning of the camera's pose, puts the tip into the scene, and what is given does not, it
+is named.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from ...camera import StereoCamera
+from ...camera import OPENCV_FROM_OPENGL, StereoCamera
 from ...errors import RecordingError
-from ...observation import MeasuredPoints
 from ...plausibility.problems import MAX_DEPTH_M, MAX_DISPARITY_SHARE
 from ...recording.frames import transform_of_rotation
+from ..grasp_table import DEFAULT_GRASP_RADIUS
 from ..units import LENGTH_UNITS
 from .gripper import state_at
 from .preparation import Preparation
@@ -26,12 +27,20 @@ SCENE_FACTOR = 2.0
 """How much further or nearer than the scene a tip may be: what the jaws hold is near what has features."""
 OTHER_UNITS = ("cm", "mm")
 """Units in which robots report beside metres."""
-MIN_PULL_M = 3 * MeasuredPoints.sd
-"""Extent of the tip's path with closed jaws below which another unit is none [m]: such a pull is noise."""
+MIN_PULL_M = DEFAULT_GRASP_RADIUS
+"""Extent of the tip's path in a grasp up to which another unit is none [m]: a pull is longer than the grip is wide."""
+OPTICAL_IN_BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Pose of the optical frame in a camera's own frame by REP-103: x forward, y left, z up."""
+CAMERA_READINGS: dict[str, Callable[[Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]]] = {
+    "as OpenGL's (y up, z backward)": lambda T: T @ OPENCV_FROM_OPENGL,
+    "as a robot's (x forward, y left, z up)": lambda T: T @ OPTICAL_IN_BODY,
+    "as the pose of the world in the camera": np.linalg.inv,
+}
+"""What the camera's pose on /tf is at times, and how it becomes that of the optical frame."""
 
 
 def tool_in_view(camera: StereoCamera, prepared: Preparation, scene: tuple[float, float] | None) -> list[str]:
-    """Return what to say where the tip is far from what the cameras see in all frames with closed jaws.
+    """Return what to say where the tip is out of view in most frames with closed jaws.
 
     Args:
         camera: the cameras.
@@ -39,76 +48,88 @@ def tool_in_view(camera: StereoCamera, prepared: Preparation, scene: tuple[float
         scene: range of the disparities that the images show [px]; None where unknown.
 
     Raises:
-        RecordingError: it is behind the camera in all of them, or another reading of the bag puts it into the scene.
+        RecordingError: it is always behind the camera, or always far out of view where another reading of the bag
+            always puts it into the scene.
     """
-    tips = _tips(prepared, prepared.tool)
-    if not len(tips) or _in_scene(camera, tips, scene, margin=MARGIN):
+    tips, _ = _tips(prepared, prepared.tool)
+    if not len(tips) or _in_scene(camera, tips, scene).mean() > 0.5:
         return []
-    T = np.linalg.inv(camera.T_world_camera)
-    seen = tips @ T[:3, :3].T + T[:3, 3]
-    tool, shown = prepared.topic("tool"), f"x, y, z = {np.median(seen, axis=0).round(4).tolist()} m"
-    cures = list(_other_readings(camera, prepared, scene))
+    near = bool(_in_scene(camera, tips, scene, margin=MARGIN).any())
+    readings = "; or ".join(_other_readings(camera, prepared, scene))
+    if near and not readings:
+        return []
+    seen = _in_camera(camera, tips)
     behind = not (seen[:, 2] > 0).any()
-    if cures or behind:
-        where = "behind the left camera" if behind else "far from what the left camera sees"
-        cure = " Or: ".join(cures) or (
-            f"Is the frame of {prepared.topic('left')} an optical one (x right, y down, z forward), and {tool} in "
-            "metres?"
+    where = "always behind the left camera" if behind else "mostly out of view" if near else "always far out of view"
+    text = f"with closed jaws the tip is {where}: x, y, z = {np.median(seen, axis=0).round(4).tolist()} m (median) in "
+    text += "the left camera's frame"
+    if scene is not None:
+        text += (
+            f", and what both cameras see is {' to '.join(f'{depth:.3g}' for depth in _depths(camera, scene))} m away"
         )
-        raise RecordingError(f"with closed jaws the tip is always {where} ({shown} in the left camera's frame). {cure}")
-    return [
-        f"WARNING: with closed jaws the tip is always far from what the left camera sees ({shown} in its frame"
-        + (
-            ""
-            if scene is None
-            else f"; what both cameras see is {_depth(camera, scene[1]):.3g} to {_depth(camera, scene[0]):.3g} m away"
-        )
-        + "); are the frames and units right?"
-    ]
+    if readings:
+        cure = f"It is in view {readings}."
+    else:
+        left, tool = prepared.topic("left"), prepared.topic("tool")
+        cure = f"Is the frame of {left} an optical one (x right, y down, z forward), and {tool} in metres?"
+    if behind or (readings and not near):
+        raise RecordingError(f"{text}. {cure}")
+    return [f"WARNING: {text}. {cure}"]
 
 
 def _other_readings(camera: StereoCamera, prepared: Preparation, scene: tuple[float, float] | None) -> Iterator[str]:
     """Yield what would put the tip into the scene, each with its cure."""
     for unit in OTHER_UNITS:
-        tips = _tips(prepared, prepared.tool.scaled(LENGTH_UNITS[unit]))
-        if np.ptp(tips, axis=0).max() > MIN_PULL_M and _in_scene(camera, tips, scene, margin=0.0):
-            yield f'Read in {unit} it is in view: give [tool] unit = "{unit}" in map.toml (--topics).'
+        tips, pull = _tips(prepared, prepared.tool.scaled(LENGTH_UNITS[unit]))
+        if pull > MIN_PULL_M and _in_scene(camera, tips, scene).all():
+            yield f'if its poses are in {unit}: give [tool] unit = "{unit}" in map.toml (--topics)'
+    tips, _ = _tips(prepared, prepared.tool)
     rectifying = transform_of_rotation(camera.left.R)
-    inverse = np.linalg.inv(camera.T_world_camera @ rectifying) @ rectifying.T
-    if _in_scene(replace(camera, T_world_camera=inverse), _tips(prepared, prepared.tool), scene, margin=0.0):
-        yield (
-            "With the inverse of the camera's pose it is in view: /tf must hold the pose of the camera in its parent, "
-            "not that of the parent in the camera."
-        )
+    for reading, optical in CAMERA_READINGS.items():
+        T = optical(camera.T_world_camera @ rectifying) @ rectifying.T
+        if _in_scene(replace(camera, T_world_camera=T), tips, scene).all():
+            yield (
+                f"if the camera's pose on /tf is read {reading}: publish that of its optical frame (x right, y down, z "
+                "forward) in its parent"
+            )
 
 
-def _tips(prepared: Preparation, tool: ToolTrack) -> Float[np.ndarray, "n 3"]:
-    """Return where the tip is in the frames with closed jaws [m]."""
-    tips: list[Float[np.ndarray, " 3"]] = []
+def _tips(prepared: Preparation, tool: ToolTrack) -> tuple[Float[np.ndarray, "n 3"], float]:
+    """Return where the tip is in the frames with closed jaws, and the largest extent of its path in a grasp [m]."""
+    grasps: dict[int, list[Float[np.ndarray, " 3"]]] = {}
     for frame in prepared.frames:
-        if state_at(prepared.jaws, frame.stamp).closed:
-            try:
-                tips.append(tool.at(frame.stamp)[0])
-            except RecordingError:
-                continue
-    return np.array(tips).reshape(-1, 3)
+        jaws = state_at(prepared.jaws, frame.stamp)
+        if jaws.closed:
+            with suppress(RecordingError):
+                grasps.setdefault(jaws.grasp, []).append(tool.at(frame.stamp)[0])
+    pull = max((float(np.ptp(tips, axis=0).max()) for tips in grasps.values()), default=0.0)
+    return np.array([tip for tips in grasps.values() for tip in tips]).reshape(-1, 3), pull
 
 
 def _in_scene(
-    camera: StereoCamera, tips: Float[np.ndarray, "n 3"], scene: tuple[float, float] | None, *, margin: float
-) -> bool:
-    """Return whether a tip is within a margin of the left image [image sizes], and as far away as the scene."""
-    T = np.linalg.inv(camera.T_world_camera)
-    before = tips[(tips @ T[:3, :3].T + T[:3, 3])[:, 2] > 0]
+    camera: StereoCamera, tips: Float[np.ndarray, "n 3"], scene: tuple[float, float] | None, *, margin: float = 0.0
+) -> Bool[np.ndarray, " n"]:
+    """Return which tips are within a margin of the left image [image sizes], and as far away as the scene."""
     size = np.array([camera.left.width, camera.left.height])
-    uvd = camera.project(before)
     if scene is None:
-        low, high = camera.focal[0] * camera.baseline / MAX_DEPTH_M, MAX_DISPARITY_SHARE * camera.left.width
+        nearest, farthest = camera.focal[0] * camera.baseline / (MAX_DISPARITY_SHARE * size[0]), MAX_DEPTH_M
     else:
-        low, high = scene[0] / SCENE_FACTOR, scene[1] * SCENE_FACTOR
-    inside = ((uvd[:, :2] > -margin * size) & (uvd[:, :2] < (1 + margin) * size)).all(axis=1)
-    return bool((inside & (uvd[:, 2] >= low) & (uvd[:, 2] <= high)).any())
+        nearest, farthest = _depths(camera, scene)
+        nearest, farthest = nearest / SCENE_FACTOR, farthest * SCENE_FACTOR
+    depth = _in_camera(camera, tips)[:, 2]
+    inside = (depth >= nearest) & (depth <= farthest)
+    pixels = camera.project(tips[inside])[:, :2]
+    inside[inside] = ((pixels > -margin * size) & (pixels < (1 + margin) * size)).all(axis=1)
+    return inside
 
 
-def _depth(camera: StereoCamera, disparity: float) -> float:
-    return camera.focal[0] * camera.baseline / disparity
+def _in_camera(camera: StereoCamera, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return places of the world in the left camera's rectified frame [m]."""
+    T = np.linalg.inv(camera.T_world_camera)
+    return places @ T[:3, :3].T + T[:3, 3]
+
+
+def _depths(camera: StereoCamera, scene: tuple[float, float]) -> tuple[float, float]:
+    """Return the distances of what is near and far in the scene [m]."""
+    low, high = scene
+    return camera.focal[0] * camera.baseline / high, camera.focal[0] * camera.baseline / low

@@ -4,6 +4,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jiggle_mj.camera import StereoCamera
 from tests.support.bag_imports import bag, cameras, imported, refused
@@ -23,8 +24,8 @@ def test_a_tip_that_no_camera_can_see_is_named(tmp_path: Path):
     """The camera is 0.1 m above the origin and looks down: a tip at 0.5 m is behind it, one at 400 m beside it."""
     (tmp_path / "beside").mkdir()
     summary, _ = imported(bag(tmp_path / "beside", cameras, write_images, tool_at(400.0, 0.0, 0.0)))
-    assert any(note.startswith("WARNING: with closed jaws the tip is always far from") for note in summary.notes)
-    why = refused(bag(tmp_path, cameras, write_images, tool_at(0.0, 0.0, 0.5)))
+    assert any(note.startswith("WARNING: with closed jaws the tip is always far out of view") for note in summary.notes)
+    why = refused(bag(tmp_path, cameras, write_images, tool_at(0.4, 0.0, 0.5)))
     assert "always behind the left camera" in why and "an optical one" in why
 
 
@@ -43,23 +44,39 @@ def test_a_tip_in_another_unit_is_named_and_read_with_it(tmp_path: Path, unit: s
             made.write("/gripper/closed", index * STEP, "std_msgs/Bool", data=True)
 
     path = bag(tmp_path, cameras, write_images, tool)
-    assert f'Read in {unit} it is in view: give [tool] unit = "{unit}" in map.toml' in refused(path)
+    assert f'It is in view if its poses are in {unit}: give [tool] unit = "{unit}" in map.toml' in refused(path)
     _, recording = imported(path, tool_unit={"mm": 1e-3, "cm": 1e-2}[unit])
     np.testing.assert_allclose(next(iter(recording)).tool.position, [0.02, 0, 0.001], rtol=1e-12)
 
 
-def test_the_inverse_of_the_cameras_pose_is_named(tmp_path: Path):
-    """A camera at (0.2, 0, 0.1) that looks down. What /tf holds is the world in the camera."""
-    T = small_camera().T_world_camera.copy()
-    T[0, 3] = 0.2
+READINGS = {
+    "as the pose of the world in the camera": np.linalg.inv,
+    "as OpenGL's": lambda T: T @ np.diag([1.0, -1.0, -1.0, 1.0]),
+    # x forward is the optical z, y left is -x, z up is -y
+    "as a robot's": lambda T: T @ np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
+}
 
-    def inverted(made: RobotBag) -> None:
+
+@pytest.mark.parametrize("reading", READINGS)
+def test_what_else_the_pose_of_the_camera_may_be_is_named(tmp_path: Path, reading: str):
+    """A camera at (0.3, 0, 0.1) that looks along x and down; the tip is 0.1 m before it."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("YZ", [130, 80], degrees=True).as_matrix()
+    T[:3, 3] = 0.3, 0.0, 0.1
+
+    def published(made: RobotBag) -> None:
         made.info("/left/camera_info", 0, small_camera().left)
         made.info("/right/camera_info", 0, small_camera().right)
-        made.tf("/tf_static", 0, made.transform("world", "left_optical", None, np.linalg.inv(T)))
+        made.tf("/tf_static", 0, made.transform("world", "left_optical", None, READINGS[reading](T)))
 
-    why = refused(bag(tmp_path, inverted, write_images, tool_at(0.2, 0.0, 0.0)))
-    assert "With the inverse of the camera's pose it is in view" in why
+    why = refused(bag(tmp_path, published, write_images, tool_at(*(T @ [0, 0, 0.1, 1])[:3])))
+    assert f"It is in view if the camera's pose on /tf is read {reading}" in why and "; or " not in why
+
+
+def test_a_tip_beside_the_image_is_no_reason_to_doubt(tmp_path: Path):
+    """Half an image beside it, where a tool holds an edge."""
+    summary, _ = imported(bag(tmp_path, cameras, write_images, tool_at(0.08, 0.0, 0.0)))
+    assert not any("WARNING" in note for note in summary.notes)
 
 
 def test_a_tip_far_from_what_both_cameras_show_is_named(tmp_path: Path):
