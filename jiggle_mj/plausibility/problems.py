@@ -47,7 +47,7 @@ MAX_UNSEEN = 0.5
 def problems(survey: Survey) -> tuple[RecordingProblem, ...]:
     """Return all problems of a surveyed recording, those that refuse it first."""
     found = [*_use(survey), *_size(survey), *_times(survey), *_camera(survey), *_tool(survey), *_noise(survey)]
-    found += (*survey.point_doubts, *survey.image_doubts)
+    found += survey.doubts
     return tuple(sorted(found, key=lambda problem: not problem.refuses))
 
 
@@ -153,7 +153,6 @@ def _camera(survey: Survey) -> Iterator[RecordingProblem]:
 
 def _tool(survey: Survey) -> Iterator[RecordingProblem]:
     """Find a tool that is elsewhere, or of another clock, and a sheet that does not move."""
-    yield from survey.tool_doubts
     if survey.why_apart is not None and survey.why_apart.refuses:
         yield survey.why_apart
         return

@@ -1,18 +1,18 @@
 """The survey of a recording: its size, times, motion and noise in numbers, from one pass and no estimator.
 
-Images are not decoded, so a survey takes about as long as reading the file.
+Few images are decoded, so a survey takes little longer than reading the file.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from ..camera import StereoCamera
-from ..observation import Observation, ToolState
+from ..observation import ToolState
 from ..recording.reader import Recording
+from .closed_tool import NS, ClosedTool
 from .held_motion import HeldMotion
 from .image_problems import image_problems
 from .increments import SummedMotion
@@ -23,8 +23,6 @@ from .tool_problems import empty_grips, outliers, tip_offset, vertical, why_apar
 
 COMPARED_FRAMES = 40
 """Most frames in which points are compared with their neighbours, evenly over the recording, which bounds the time."""
-NS = 1e-9
-"""Seconds in a nanosecond [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +57,6 @@ class Survey:
     """Largest mean displacement of the held points since the jaws closed [m]."""
     missing_tracks: tuple[int, ...]
     """Held tracks that no point has."""
-    point_doubts: tuple[RecordingProblem, ...]
-    """What is doubtful about which point is which, and about what their displacements are counted from."""
     grasps: int
     """Number of grasps with closed jaws."""
     closed_frames: int
@@ -79,8 +75,6 @@ class Survey:
     """Largest difference of the tool's displacement and that of the held points, since the jaws closed [m]."""
     why_apart: RecordingProblem | None
     """What explains that tool and held points move differently."""
-    tool_doubts: tuple[RecordingProblem, ...]
-    """What else is doubtful about the tool, and about the declared bed under what it lifts."""
     declared_sd_m: float | None
     """Noise of a coordinate as the recording states it [m]."""
     noise_sd_m: float | None
@@ -97,68 +91,11 @@ class Survey:
     """Disparity at that distance [px]."""
     tool_in_view: bool | None
     """Whether the tool is inside the left image whenever the jaws close."""
-    image_doubts: tuple[RecordingProblem, ...]
-    """What is wrong or doubtful about the images."""
+    doubts: tuple[RecordingProblem, ...]
+    """What only the frames themselves show: about the tool, the bed under what it lifts, which point is which, and the
+    images."""
     declared: bool
     """Whether the recording declares the tissue; else the defaults hold."""
-
-
-@dataclass(kw_only=True)
-class _Closed:
-    """The tool while the jaws are closed."""
-
-    grasps: set[int] = field(default_factory=set)
-    frames: int = 0
-    motion: float = 0.0
-    path: float = 0.0
-    speed: float | None = None
-    gap: float | None = None
-    held: float | None = None
-    largest_gap_ns: int | None = None
-    by_points: bool = False
-    distances: list[float] = field(default_factory=list)
-    closings: list[ToolState] = field(default_factory=list)
-    _last: Observation | None = None
-
-    def begins(self, observation: Observation) -> bool:
-        """Return whether the jaws close in this frame."""
-        tool = observation.tool
-        return tool.closed and (self._last is None or not self._last.tool.closed or self._last.tool.grasp != tool.grasp)
-
-    def add(self, observation: Observation, held: Float[np.ndarray, " 3"], at_closing: Float[np.ndarray, " 3"]) -> None:
-        """Take one frame.
-
-        Args:
-            observation: the frame.
-            held: displacement of the held points since the jaws closed [m], NaN if unknown.
-            at_closing: where they were then [m].
-        """
-        tool, last = observation.tool, self._last
-        if not tool.closed:
-            self._last = observation
-            return
-        if self.begins(observation):
-            self.closings.append(tool)
-        elif last is not None:
-            step, lasted = float(np.linalg.norm(tool.position - last.tool.position)), observation.time - last.time
-            self.path += step
-            self.largest_gap_ns = max(self.largest_gap_ns or 0, lasted)
-            if lasted > 0:
-                self.speed = max(self.speed or 0.0, step / (lasted * NS))
-        closing = self.closings[-1]
-        moved = tool.position - closing.position
-        self.motion = max(self.motion, float(np.linalg.norm(moved)))
-        if np.isfinite(held).all():
-            self.held = max(self.held or 0.0, float(np.linalg.norm(held)))
-            turned = (_rotation(tool) * _rotation(closing).inv()).apply(at_closing - closing.position)
-            carried = moved + turned - (at_closing - closing.position)
-            # A tool whose offset from the held points is not rigid is judged by its displacement alone.
-            gap = min(float(np.linalg.norm(held - each)) for each in (moved, carried))
-            self.gap = max(self.gap or 0.0, gap)
-        self.grasps.add(tool.grasp)
-        self.frames += 1
-        self.by_points |= tool.by_points
-        self._last = observation
 
 
 def survey(recording: Recording) -> Survey:
@@ -167,7 +104,7 @@ def survey(recording: Recording) -> Survey:
     Args:
         recording: an open recording; iterating it anew afterwards begins at its first frame.
     """
-    motion, closed, times, track = PointMotion(), _Closed(), list[int](), HeldMotion()
+    motion, closed, times, track = PointMotion(), ClosedTool(), list[int](), HeldMotion()
     summed = SummedMotion()
     tools: list[tuple[int, ToolState]] = []
     stride = max(1, len(recording) // COMPARED_FRAMES)
@@ -233,7 +170,6 @@ def survey(recording: Recording) -> Survey:
         points_motion_m=motion.largest if motion.n_expected else None,
         held_motion_m=closed.held,
         missing_tracks=motion.missing_tracks,
-        point_doubts=tuple(point_problems(motion.identity, summed)),
         grasps=len(closed.grasps),
         closed_frames=closed.frames,
         tool_by_points=closed.by_points,
@@ -243,7 +179,6 @@ def survey(recording: Recording) -> Survey:
         tool_speed_m_s=closed.speed,
         tool_gap_m=closed.gap,
         why_apart=why,
-        tool_doubts=tuple(doubts),
         declared_sd_m=declared_sd,
         noise_sd_m=noise_sd,
         noise_from=noise_from,
@@ -252,7 +187,7 @@ def survey(recording: Recording) -> Survey:
         tool_depth_m=depth,
         tool_disparity_px=disparity,
         tool_in_view=in_view,
-        image_doubts=tuple(image_problems(recording, tools)),
+        doubts=(*doubts, *point_problems(motion.identity, summed), *image_problems(recording, tools)),
         declared=recording.declared,
     )
 
@@ -272,7 +207,3 @@ def _in_camera(
     uvd = camera.project(world)
     inside = (uvd[:, :2] >= 0).all() and (uvd[:, :2] < (camera.left.width, camera.left.height)).all()
     return depth, camera.focal[0] * camera.baseline / depth, bool(inside)
-
-
-def _rotation(tool: ToolState) -> Rotation:
-    return Rotation.from_quat(tool.quat_wxyz, scalar_first=True)

@@ -58,10 +58,12 @@ def described_folder(where: Path) -> Reader:
     """Return the import of a folder whose recording.toml is to be damaged."""
     where = where / "described"
     where.mkdir()
-    np.savez(where / "points.npz", p=FRAMES, v=np.ones((2, 12), bool), tool=FRAMES[:, 0], tool_time=[0.0, 1.0], t=[0.0, 1.0])
+    times = [0.0, 1.0]
+    np.savez(where / "points.npz", p=FRAMES, v=np.ones((2, 12), bool), tool=FRAMES[:, 0], tool_time=times, t=times)
     keys = 'files = ["points.npz"]\nkey = "p"\nvisibility = "v"\nmissing = [0.0, 0.0, 0.0]\ntimes = "t"'
     tool = 'tool = "tool"\ntool_times = "tool_time"\ntool_unit = "mm"\ntool_clock_offset = 0.0\nradius = 0.002'
-    toml = TOML.replace(FILES, keys).replace("period = 0.5\n", "").replace("[grasp]", f"[mesh]\nmargin = 0.004\n[grasp]\n{tool}")
+    toml = TOML.replace(FILES, keys).replace("period = 0.5\n", "")
+    toml = toml.replace("[grasp]", f"[mesh]\nmargin = 0.004\n[grasp]\n{tool}")
     (where / "recording.toml").write_text(toml)
     return Reader(path=where / "recording.toml", read=_folder_import(where), valid=toml.encode())
 

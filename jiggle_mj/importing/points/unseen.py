@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ...errors import RecordingError
 from ...plausibility.identity import SAME_PLACE_M, PointIdentity, isolated

@@ -79,8 +79,8 @@ def found(path, pair: Pair) -> dict[str, bool]:
             )
             writer.write(Observation(index=frame, time=frame * 10**8, tool=tool, images=pair.at(frame)))
     surveyed = survey(Recording.open(path / "run.mcap"))
-    assert set(surveyed.image_doubts) <= set(problems(surveyed))
-    return {each.name: each.refuses for each in surveyed.image_doubts}
+    assert set(surveyed.doubts) <= set(problems(surveyed))
+    return {each.name: each.refuses for each in surveyed.doubts}
 
 
 def test_a_right_pair_has_no_problem(tmp_path):

@@ -110,7 +110,7 @@ def test_points_of_which_most_are_wrong_are_refused(tmp_path, edit, name):
 
 def test_an_exchange_is_counted(tmp_path):
     """Two of 120 points take each other's place in one step."""
-    (text,) = [each.text for each in found(tmp_path, changed(exchange))[0].point_doubts]
+    (text,) = [each.text for each in found(tmp_path, changed(exchange))[0].doubts]
     assert text.startswith("2 points take places of others, up to 2% of a frame's points, in 1 frames")
 
 
@@ -130,7 +130,7 @@ def move_by_a_spacing(positions: np.ndarray) -> None:
 @pytest.mark.parametrize("edit", [unseen, drift, move_by_a_spacing])
 def test_points_that_are_the_same_are_not_doubted(tmp_path, edit):
     """Also where every point comes to the very place of its neighbour, as all do."""
-    assert found(tmp_path, changed(edit))[0].point_doubts == ()
+    assert found(tmp_path, changed(edit))[0].doubts == ()
 
 
 def test_noise_of_a_fifth_of_the_spacing_is_no_exchange(tmp_path):
