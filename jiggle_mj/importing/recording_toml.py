@@ -18,6 +18,7 @@ from .. import toml_kinds as kinds
 from ..errors import RecordingError
 from ..observation import Declaration
 from ..recording.schemas import NS_PER_S
+from ..recording.stored_arrays import MAX_LENGTH_M
 from ..toml_kinds import StrictTable
 from .clock import MAX_PERIOD, MIN_PERIOD
 from .data_folder import quoted
@@ -27,6 +28,8 @@ from .units import LENGTH_UNITS, TIME_UNITS, unit_of
 
 MAX_ROTATION_ERROR = 2e-5
 """Largest entry of R R^T - 1 of a rotation: the rounding of five decimals."""
+MAX_MARGIN_M = 10.0
+"""Width of a margin [m]: no sheet that is estimated is larger."""
 MAX_OUTLINE_POINTS = 1000
 """Corners that an outline may have."""
 
@@ -197,7 +200,7 @@ def _period(top: StrictTable) -> int:
 
 def _margin(mesh: StrictTable) -> Margin | None:
     margin = Margin(
-        width=mesh.take("margin", kinds.positive, None),
+        width=mesh.take("margin", _width, None),
         outline=mesh.take("outline", _outline, None),
         spacing=mesh.take("spacing", kinds.positive, None),
     )
@@ -210,6 +213,13 @@ def _margin(mesh: StrictTable) -> Margin | None:
     return margin
 
 
+def _width(value: Any) -> float:
+    width = kinds.positive(value)
+    if width > MAX_MARGIN_M:
+        raise TypeError(f"a number of m above 0 and up to {MAX_MARGIN_M:g}")
+    return width
+
+
 def _outline(value: Any) -> Float[np.ndarray, "k 3"]:
     kind = f"a list of 3 to {MAX_OUTLINE_POINTS} corners, all [x, y] or all [x, y, z]"
     if not isinstance(value, list) or not 3 <= len(value) <= MAX_OUTLINE_POINTS:
@@ -218,6 +228,8 @@ def _outline(value: Any) -> Float[np.ndarray, "k 3"]:
     if lengths not in ({2}, {3}):
         raise TypeError(kind)
     corners = np.array([[kinds.number(number) for number in corner] for corner in value])
+    if np.abs(corners).max() > MAX_LENGTH_M:
+        raise TypeError(f"{kind}, within {MAX_LENGTH_M:g} m of the origin")
     return corners if lengths == {3} else np.column_stack([corners, np.full(len(corners), np.nan)])
 
 

@@ -24,6 +24,8 @@ from .compression import bound_chunks, decompressed_message, take_messages_compr
 
 ROS_ENCODINGS = ("cdr", "ros1")
 """Encodings of the messages of ROS 2 and ROS 1."""
+MAX_NAME = 255
+"""Characters of a topic's name, the most that ROS 2 allows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +93,11 @@ class Bag:
         with refusing(self.path):
             for source in self._sources:
                 for topic in source.topics():
+                    if len(topic.name) > MAX_NAME:
+                        raise RecordingError(
+                            f"{self.path}: the name of topic '{topic.name[:40]}...' is {len(topic.name)} characters "
+                            f"long; at most {MAX_NAME} are read."
+                        )
                     known = merged.get(topic.name)
                     merged[topic.name] = topic if known is None else replace(known, count=known.count + topic.count)
         return dict(sorted(merged.items()))

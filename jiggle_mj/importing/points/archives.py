@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from io import BytesIO
 from lzma import LZMAError
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from jaxtyping import Shaped
@@ -119,7 +120,7 @@ def _read_npz(path: Path, key: str) -> Shaped[np.ndarray, "..."]:
         with archive.open(info) as stream:
             _refuse_large(path, key, stream.read(HEADER_BYTES), info.file_size)
         with archive.open(info) as stream:
-            return npy_format.read_array(stream, allow_pickle=False)
+            return _plain_array(stream)
 
 
 def _read_mat(path: Path, key: str) -> Shaped[np.ndarray, "..."]:
@@ -132,6 +133,12 @@ def _read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     with path.open("rb") as stream:
         _refuse_large(path, "the array", stream.read(HEADER_BYTES), path.stat().st_size)
         stream.seek(0)
+        return _plain_array(stream)
+
+
+def _plain_array(stream: IO[bytes]) -> Shaped[np.ndarray, "..."]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # see _header
         return npy_format.read_array(stream, allow_pickle=False)
 
 

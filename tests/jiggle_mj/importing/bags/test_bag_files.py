@@ -163,6 +163,13 @@ def test_a_definition_that_nobody_reads_stops_nothing(tmp_path: Path):
             next(bag.messages(["/odd"]))
 
 
+def test_a_name_longer_than_ros_allows_is_refused(tmp_path: Path):
+    with RobotBag(tmp_path / "bag") as bag:
+        bag.image("/" + "x" * 255, 0, "rgb8", small_image(0))
+    with pytest.raises(RecordingError, match=r"name of topic '/x+\.\.\.' is 256 characters long; at most 255"):
+        import_bag(bag.path, tmp_path / "run.mcap")
+
+
 def test_what_is_no_bag_is_named(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.bag").write_text("no bag")
