@@ -103,7 +103,7 @@ def _of_archives(folder: Path, names: list[str], failures: list[str]) -> list[Po
             failures.append(str(failure))
             continue
         for key, shape in shapes.items():
-            if len([length for length in shape if length > 1]) == 3 and 2 <= shape[-1] <= 3:
+            if len([length for length in shape if length > 1]) == 3 and 2 <= shape[-1] <= 4:
                 pixels = re.search(r"px|pixel|uv|image", key, re.IGNORECASE) is not None
                 sized.append((0 if pixels else int(np.prod(shape)), PointFiles(files=(name,), key=key)))
     return [files for _, files in sorted(sized, key=lambda item: -item[0])]

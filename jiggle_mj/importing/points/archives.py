@@ -20,7 +20,7 @@ from ...errors import RecordingError
 from ...recording.npz_arrays import MALFORMED
 from ..data_folder import quoted
 from .file_kinds import MAX_POSITION_BYTES, file_kind
-from .mat_files import mat_arrays
+from .mat_files import mat_arrays, mat_others
 
 DAMAGE = (
     *MALFORMED,
@@ -36,6 +36,14 @@ HEADER_BYTES = 2**14
 """Length in which an array's header ends; numpy itself reads no longer ones [bytes]."""
 NUMBER_KINDS = "biuf"
 """Kinds of arrays that hold plain numbers: bool, int, unsigned, float."""
+OTHER_KINDS = {
+    "O": "objects, which are never read: save numbers",
+    "c": "complex numbers: save their parts as coordinates",
+    "M": 'dates: save .astype("int64"), and give time_unit',
+    "m": 'durations: save .astype("int64"), and give time_unit',
+    "V": "records: save their fields as one array of numbers",
+}
+"""What other arrays hold, and what to do; those that are missing hold text."""
 HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
 """Readers of the headers of plain arrays, by the format's version."""
 MAX_LISTED = 12
@@ -72,11 +80,15 @@ def read_array(path: Path, key: str | None) -> Shaped[np.ndarray, "..."]:
         if kind == "npy":
             return _read_npy(path)
         shapes = _npz_shapes(path) if kind == "npz" else {name: array.shape for name, array in mat_arrays(path)}
-        if key is None or key not in shapes:
-            what = (
-                "needs [points] key, the name of one of its arrays" if key is None else f"has no array '{quoted(key)}'"
+        if key is None:
+            raise RecordingError(
+                f"{path} needs [points] key, the name of one of its arrays; it has {describe(shapes)}."
             )
-            raise RecordingError(f"{path} {what}; it has {describe(shapes)}.")
+        if key not in shapes:
+            others = _npz_others(path) if kind == "npz" else mat_others(path)
+            if key in others:
+                raise RecordingError(f"{path}: {quoted(key)} holds {others[key]}; plain numbers are read.")
+            raise RecordingError(f"{path} has no array '{quoted(key)}'; it has {describe(shapes)}.")
         array = _read_npz(path, key) if kind == "npz" else _read_mat(path, key)
     if array.dtype.kind not in NUMBER_KINDS:
         raise RecordingError(f"{path}: {key} holds {array.dtype}, not plain numbers.")
@@ -103,15 +115,30 @@ def describe(shapes: dict[str, tuple[int, ...]]) -> str:
 
 
 def _npz_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    shapes = {}
+    return {name: shape for name, (shape, dtype) in _npz_headers(path).items() if dtype.kind in NUMBER_KINDS}
+
+
+def _npz_others(path: Path) -> dict[str, str]:
+    """Return what each array without plain numbers holds, by its name."""
+    headers = _npz_headers(path).items()
+    return {name: _what(dtype) for name, (_, dtype) in headers if dtype.kind not in NUMBER_KINDS}
+
+
+def _npz_headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    """Return shape and type of each array; a member that does not begin as one is left out."""
+    found = {}
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
             if info.filename.endswith(".npy"):
                 with archive.open(info) as stream:
                     header = _header(stream.read(HEADER_BYTES))
                 if header is not None:
-                    shapes[info.filename.removesuffix(".npy")] = header[0]
-    return shapes
+                    found[info.filename.removesuffix(".npy")] = header
+    return found
+
+
+def _what(dtype: np.dtype) -> str:
+    return OTHER_KINDS.get(dtype.kind, "text")
 
 
 def _read_npz(path: Path, key: str) -> Shaped[np.ndarray, "..."]:
@@ -146,8 +173,10 @@ def _refuse_large(path: Path, name: str, head: bytes, n_bytes: int) -> None:
     """Refuse an array whose header declares no plain numbers, too many, or another number than the file holds."""
     header = _header(head)
     if header is None:
-        raise RecordingError(f"{path}: {name} holds no plain numbers; objects are never read.")
+        raise RecordingError(f"{path}: {name} does not begin as an array.")
     shape, dtype = header
+    if dtype.kind not in NUMBER_KINDS:
+        raise RecordingError(f"{path}: {name} holds {_what(dtype)}; plain numbers are read.")
     declared = 8  # bytes of a number once it is read
     for length in shape:
         declared *= length
@@ -161,7 +190,7 @@ def _refuse_large(path: Path, name: str, head: bytes, n_bytes: int) -> None:
 
 
 def _header(head: bytes) -> tuple[tuple[int, ...], np.dtype] | None:
-    """Return shape and type of the array that begins with these bytes; None where it holds no plain numbers."""
+    """Return shape and type of the array that begins with these bytes; None where none does."""
     stream = BytesIO(head)
     try:
         reader = HEADERS.get(npy_format.read_magic(stream))
@@ -172,4 +201,4 @@ def _header(head: bytes) -> tuple[tuple[int, ...], np.dtype] | None:
             shape, _, dtype = reader(stream)
     except ValueError:
         return None
-    return (shape, dtype) if dtype.kind in NUMBER_KINDS and all(length >= 0 for length in shape) else None
+    return (shape, dtype) if all(length >= 0 for length in shape) else None

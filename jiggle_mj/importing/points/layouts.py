@@ -15,6 +15,8 @@ FRAMES_FIRST: Layout = ("frames", "points", "xyz")
 MAX_PLANE, MAX_SPACE = 2, 3
 """Coordinates of a point in a plane and in space."""
 
+_FOURTH = " Save x, y, z without the fourth; if that says which points are seen, as an array for visibility."
+
 
 def read_layout(text: str, where: str) -> Layout:
     """Return the order of axes that a text such as "points, frames" states; xyz is last where it is not named.
@@ -57,9 +59,11 @@ def frames_first(
         if moved.shape[2] not in (MAX_PLANE, MAX_SPACE):
             raise RecordingError(
                 f'{name} has shape {shape}; layout "{", ".join(layout)}" makes that {moved.shape[2]} coordinates a '
-                "point, which must be 3, or 2 in a plane."
+                f"point, which must be 3, or 2 in a plane.{_FOURTH * (moved.shape[2] == MAX_SPACE + 1)}"
             )
         return moved
+    if shape[2] == MAX_SPACE + 1:
+        raise RecordingError(f"{name} has shape {shape}, with 4 numbers a point: 3 are read, or 2 in a plane.{_FOURTH}")
     if shape[2] not in (MAX_PLANE, MAX_SPACE):
         raise RecordingError(
             f'{name} must have shape (frames, points, 3); it has {shape}. Give the order of its axes: layout = "frames,'

@@ -25,6 +25,8 @@ CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13:
 """Numpy's type for each class of array, whose numbers may be stored as smaller ones."""
 LOGICAL, COMPLEX = 0x200, 0x800
 """Flags of an array."""
+OTHER_CLASSES = {1: "cells", 2: "structures", 3: "objects", 4: "text", 5: "a sparse matrix: save full(...)"}
+"""What arrays of classes without plain numbers hold."""
 
 
 def mat_arrays(path: Path) -> Iterator[tuple[str, Shaped[np.ndarray, "..."]]]:
@@ -33,14 +35,36 @@ def mat_arrays(path: Path) -> Iterator[tuple[str, Shaped[np.ndarray, "..."]]]:
     Raises:
         ValueError, struct.error, zlib.error: the file is damaged, or holds too much.
     """
+    for payload, order in _matrices(path):
+        bits = _flags(payload, order)
+        if bits & 0xFF in CLASSES and not bits & COMPLEX:
+            yield _array(payload, order, bits)
+
+
+def mat_others(path: Path) -> dict[str, str]:
+    """Return what each array without plain numbers holds, by its name.
+
+    Raises:
+        ValueError, struct.error, zlib.error: the file is damaged, or holds too much.
+    """
+    found: dict[str, str] = {}
+    for payload, order in _matrices(path):
+        bits, parts = _flags(payload, order), list(_elements(payload, order))
+        if bits & 0xFF in OTHER_CLASSES or bits & COMPLEX:
+            name = parts[2][1].decode("ascii", "replace") if len(parts) > 2 else ""
+            found[name] = OTHER_CLASSES.get(bits & 0xFF, "complex numbers")
+    return found
+
+
+def _matrices(path: Path) -> Iterator[tuple[bytes, str]]:
+    """Yield bytes and byte order of each array."""
     data = path.read_bytes()
     order = ">" if data[HEADER_BYTES - 2 : HEADER_BYTES] == b"MI" else "<"
     for kind, payload in _elements(data[HEADER_BYTES:], order):
         if kind == COMPRESSED:
             kind, payload = next(_elements(_inflated(payload), order), (0, b""))
-        found = _array(payload, order) if kind == MATRIX else None
-        if found is not None:
-            yield found
+        if kind == MATRIX:
+            yield payload, order
 
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
@@ -66,13 +90,16 @@ def _inflated(payload: bytes) -> bytes:
     return data
 
 
-def _array(payload: bytes, order: str) -> tuple[str, Shaped[np.ndarray, "..."]] | None:
-    """Return name and numbers of an array; None for other classes."""
+def _flags(payload: bytes, order: str) -> int:
+    """Return class and flags of an array."""
+    _, flags = next(_elements(payload, order), (0, b""))
+    return struct.unpack_from(f"{order}I", flags)[0]
+
+
+def _array(payload: bytes, order: str, bits: int) -> tuple[str, Shaped[np.ndarray, "..."]]:
+    """Return name and numbers of an array with those flags."""
     parts = _elements(payload, order)
-    _, flags = next(parts, (0, b""))
-    bits = struct.unpack_from(f"{order}I", flags)[0]
-    if bits & 0xFF not in CLASSES or bits & COMPLEX:
-        return None
+    next(parts, None)
     shape = np.frombuffer(next(parts, (0, b""))[1], f"{order}i4").tolist()
     name = next(parts, (0, b""))[1].decode("ascii")
     kind, numbers = next(parts, (0, b""))

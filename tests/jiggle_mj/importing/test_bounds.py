@@ -68,7 +68,7 @@ def npz(member: bytes) -> bytes:
         (npz(header("(1" + "0" * 400 + ", 3)")), "at most 134217728 bytes are read|cannot be read"),
         (npz(header("(400, 30000, 3)") + bytes(30_000_000)), "at most 134217728 bytes are read"),
         (npz(header("(2, 12, 3)") + bytes(100)), "the file ends before that"),
-        (npz(header("(2, 12, 3)", "'|O'") + bytes(600)), "has no array 'p'; it has none of numbers"),
+        (npz(header("(2, 12, 3)", "'|O'") + bytes(600)), "p holds objects, which are never read"),
         (npz(header("(-2, 12, 3)")), "has no array 'p'|cannot be read"),
         (npz(b"\x80\x04K\x01."), "has no array 'p'"),
         (npz(header("(2, 12, 3)") + bytes(576))[:-40], r"cannot be read as \.npz"),

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from scipy.io import savemat
+from scipy.sparse import coo_array
 
 from jiggle_mj.errors import OutputError, RecordingError
 from jiggle_mj.importing.folder import import_folder
@@ -122,6 +124,50 @@ def test_a_wrong_archive_is_refused(tmp_path):
         bring_in(where)
     (where / "d.npz").write_bytes(b"no archive")
     with pytest.raises(RecordingError, match=r"cannot be read as \.npz"):
+        bring_in(where)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.full((2, 12, 3), 1j), "p holds complex numbers: save their parts"),
+        (np.full((2, 12, 3), None), "p holds objects, which are never read"),
+        (np.zeros((2, 12, 3), "datetime64[s]"), "p holds dates: save .*int64.*time_unit"),
+        (np.zeros((2, 12, 3), "timedelta64[s]"), "p holds durations"),
+        (np.full((2, 12, 3), "1.0"), "p holds text; plain numbers are read"),
+        (np.zeros((2, 12), [("x", float), ("y", float)]), "p holds records"),
+        (np.ones((2, 12, 4)), r"shape \(2, 12, 4\), with 4 numbers a point.* as an array for visibility"),
+    ],
+)
+@pytest.mark.parametrize("suffix", ["npz", "npy"])
+def test_an_array_of_other_things_is_refused_by_what_it_holds(tmp_path, array, message, suffix):
+    where = npz_folder(tmp_path, faces=GRID_FACES, mesh="")
+    np.savez(where / "d.npz", p=array)
+    if suffix == "npy":
+        np.save(where / "d.npy", array)
+        toml = (where / "recording.toml").read_text()
+        (where / "recording.toml").write_text(toml.replace('"d.npz"]\nkey = "p"', '"d.npy"]'))
+        message = message.replace("p holds", "the array holds")
+    with pytest.raises(RecordingError, match=message):
+        bring_in(where)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.full((2, 12, 3), 1j), "p holds complex numbers"),
+        ("text", "p holds text"),
+        ({"x": np.zeros(3)}, "p holds structures"),
+        (np.array([np.zeros(3), "a"], object), "p holds cells"),
+        (coo_array(np.eye(3)), "p holds a sparse matrix"),
+    ],
+)
+def test_an_array_of_matlab_of_other_things_is_refused_by_what_it_holds(tmp_path, array, message):
+    where = npz_folder(tmp_path, faces=GRID_FACES, mesh="")
+    savemat(where / "d.mat", {"p": array})
+    toml = (where / "recording.toml").read_text()
+    (where / "recording.toml").write_text(toml.replace("d.npz", "d.mat"))
+    with pytest.raises(RecordingError, match=message):
         bring_in(where)
 
 
