@@ -18,7 +18,7 @@ NONE = "none"
 """Value of `visibility` and `missing` that says: every finite position was seen."""
 ARCHIVE = re.compile(r"\.(npz|mat)$", re.IGNORECASE)
 """Names of archives, whose arrays have keys."""
-SEPARATORS = {",": ",", ";": ";", "\t": "\t", "tab": "\t", " ": " ", "blanks": " "}
+SEPARATORS = {",": ",", ";": ";", "|": "|", ":": ":", "\t": "\t", "tab": "\t", " ": " ", "blanks": " "}
 """Values of `separator`, and the character each stands for."""
 DEFAULT_VISIBILITY_THRESHOLD = 0.5
 """Probability of being visible from which a point counts as seen: likelier seen than not."""
@@ -137,7 +137,7 @@ def _anything(value: Any) -> Any:
 
 def _separator(value: Any) -> str:
     if value not in SEPARATORS:
-        raise TypeError('one of ",", ";", "tab", "blanks"')
+        raise TypeError('one of ",", ";", "|", ":", "tab", "blanks"')
     return SEPARATORS[value]
 
 

@@ -17,7 +17,7 @@ from .text_lines import TextLines
 
 BLANKS = " "
 """Separator that stands for any blanks and tabs."""
-MARKS = (";", "\t", ",")
+MARKS = (";", "\t", "|", ":", ",")
 """Separators that are a character of their own; blanks are tried where none of them is."""
 SAMPLE_LINES = 1000
 """Lines by which a format is found; the reader then checks all of them."""
@@ -138,7 +138,7 @@ def find_format(
         number, line = text.lines[valid[0].first]
         raise RecordingError(
             f"{text.path}: line {number}, '{quoted(line)}', can be read "
-            'in more than one way: give separator ("," ";" "tab" "blanks") and decimal ("." ",") in [points].'
+            'in more than one way: give separator ("," ";" "|" ":" "tab" "blanks") and decimal ("." ",") in [points].'
         )
     return valid[0]
 
