@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
-from difflib import get_close_matches
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from .errors import MAX_SHOWN, OptionError
+from .likely_name import likeliest
 
 T = TypeVar("T")
 
@@ -78,10 +78,10 @@ def _changed(config: T, table: Mapping[str, Any], *, where: str, prefix: str, kn
 
 def _meant(name: str, known: list[str]) -> str:
     """Return the known dotted name that was probably meant, by its last part first, as a question."""
-    leaf = name.rpartition(".")[2]
     by_leaf = {each.rpartition(".")[2]: each for each in known}
-    near = [by_leaf[each] for each in get_close_matches(leaf, by_leaf, n=1)] or get_close_matches(name, known, n=1)
-    return f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known[:8])} and others (docs/USAGE.md)."
+    leaf = likeliest(name.rpartition(".")[2], by_leaf)
+    near = likeliest(name, known) if leaf is None else by_leaf[leaf]
+    return f"; did you mean {near}?" if near else f"; known: {', '.join(known[:8])} and others (docs/USAGE.md)."
 
 
 def _typed(value: Any, kind: Any, where: str) -> Any:

@@ -11,10 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from .errors import MAX_SHOWN, RecordingError
-from .likely_name import did_you_mean
+from .likely_name import did_you_mean, likeliest
 
 MAX_COUNT = (1 << 31) - 1
 """Largest whole number: signed 32 bits, in which recordings store numbers of points and grasps."""
+MISSPELT = 0.75
+"""Likeness from which a given key is offered for one that is missing: `units` is like `unit`, `time_unit` is not."""
 REQUIRED = object()
 """Default of a key without a default."""
 
@@ -34,7 +36,9 @@ class StrictTable:
         self.known.add(key)
         if key not in self.values:
             if default is REQUIRED:
-                raise RecordingError(f"{self.where} lacks the key '{key}'.")
+                given = likeliest(key, set(self.values) - self.known, likeness=MISSPELT)
+                meant = "." if given is None else f"; did you write {shown(given)} for it?"
+                raise RecordingError(f"{self.where} lacks the key '{key}'{meant}")
             return default
         try:
             return kind(self.values[key])

@@ -5,6 +5,7 @@ data files, whose unit the description gives.
 """
 
 import json
+import os
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -24,6 +25,7 @@ from .clock import MAX_PERIOD, MIN_PERIOD
 from .data_folder import quoted
 from .grasp_table import GraspTable, Rows, read_choice, read_grasps
 from .points.points_table import PointFiles, read_points_table
+from .points.text_lines import read_text
 from .units import LENGTH_UNITS, TIME_UNITS, unit_of
 
 MAX_ROTATION_ERROR = 2e-5
@@ -129,14 +131,12 @@ def read_recording_toml(path: Path) -> MeasuredRecording:
     Raises:
         RecordingError: the file is missing or no TOML, a key is unknown or missing, or a value is of the wrong kind.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as failure:
+    if not os.path.lexists(path):
         raise RecordingError(
-            f"{path} is missing; it describes the data. Let 'jiggle-mj init {path.parent}' write one, then check it."
-        ) from failure
-    except (OSError, ValueError) as failure:
-        raise RecordingError(f"{quoted(path)} cannot be read: {quoted(failure)}.") from failure
+            f"{quoted(path)} is missing; it describes the data. Let 'jiggle-mj init {quoted(path.parent)}' write one, "
+            "then check it."
+        )
+    text = read_text(path)
     try:
         top = StrictTable(tomllib.loads(text), str(path))
     except (ValueError, RecursionError) as failure:  # TOMLDecodeError, or a number of thousands of digits

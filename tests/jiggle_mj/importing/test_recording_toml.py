@@ -11,7 +11,12 @@ from tests.support.measured_folder import TOML, bring_in, folder
     ("old", "new", "message"),
     [
         ('unit = "mm"', 'unit = "inch"', "unit must be one of m, cm, mm, um; got 'inch'"),
-        ('unit = "mm"', "", "lacks the key 'unit'"),
+        ('unit = "mm"', "", r"lacks the key 'unit'\.$"),
+        ('unit = "mm"', 'units = "mm"', r"lacks the key 'unit'; did you write 'units' for it\?"),
+        ('unit = "mm"', 'Unit = "mm"', "did you write 'Unit' for it"),
+        ('unit = "mm"', 'time_unit = "ms"', r"lacks the key 'unit'\.$"),
+        ("noise_sd = 1e-4", "noise = 1e-4", "lacks the key 'noise_sd'; did you write 'noise' for it"),
+        ('files = ["rest.xyz", "pulled_*.xyz"]', 'file = ["rest.xyz"]', "lacks the key 'files'; did you write 'file'"),
         ("period = 0.5", "period = 0", "period must be a number above 0; got 0"),
         ('name = "grid"', "name = 3", "name must be a text; got 3"),
         (
@@ -60,3 +65,17 @@ def test_a_wrong_toml_is_refused_with_key_value_and_what_is_allowed(tmp_path, ol
 def test_a_missing_toml_is_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"recording\.toml is missing.*jiggle-mj init"):
         import_folder(tmp_path, None, tmp_path / "run.mcap")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32", "cp1252"])
+def test_a_description_in_any_marked_encoding_is_read(tmp_path, encoding):
+    where = folder(tmp_path)
+    (where / "recording.toml").write_bytes(TOML.replace('"grid"', '"größe"').encode(encoding))
+    assert bring_in(where)[0].n_frames == 3
+
+
+def test_a_description_in_an_unmarked_encoding_is_refused_by_name(tmp_path):
+    where = folder(tmp_path)
+    (where / "recording.toml").write_bytes(TOML.encode("utf-16-le"))
+    with pytest.raises(RecordingError, match=r"UTF-16 needs its mark \(BOM\)"):
+        bring_in(where)
