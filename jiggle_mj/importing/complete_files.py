@@ -26,12 +26,12 @@ def complete_files(recording: Path, *, overwrite: bool) -> Iterator[tuple[Path, 
     Raises:
         OutputError: a file exists and `overwrite` is false, another process writes it, or it cannot be written.
     """
-    truth = truth_path(recording)
     if recording.exists() and not (recording.is_file() or recording.is_dir()):
         raise OutputError(f"{recording} is a device or a pipe; give a file, such as run.mcap.")
     claim = PartialFile(recording, overwrite=overwrite)
     folder: Path | None = None
     try:
+        truth = truth_path(recording)
         if truth.exists() and not overwrite:
             raise OutputError(f"{truth} exists; choose another path, or allow the file to be replaced (--overwrite).")
         folder = Path(tempfile.mkdtemp(prefix=f".{recording.name[:50]}-", dir=recording.parent))

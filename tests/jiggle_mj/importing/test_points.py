@@ -183,6 +183,12 @@ def test_an_existing_output_is_not_overwritten_unasked(tmp_path):
     bring_in(where, overwrite=True)
 
 
+@pytest.mark.parametrize("out", ["", "/", ".."])
+def test_an_output_without_a_name_is_refused(tmp_path, out):
+    with pytest.raises(OutputError, match=r"is a folder; give a file, such as .*run\.mcap"):
+        import_folder(folder(tmp_path), None, out)
+
+
 def test_measured_data_stays_unchanged(tmp_path):
     """The importer writes beside `out` only; the folder may be read-only."""
     where = folder(tmp_path)
