@@ -27,10 +27,10 @@ from .known_attachments import measured_truth
 from .point_files import read_frames
 from .points.archives import read_array
 from .points.headings import PIXELS
-from .points.measured import PointFrames
+from .points.measured import PointFrames, is_planar
 from .recording_toml import MeasuredRecording, read_recording_toml
 from .tool import Tool
-from .units import LENGTH_UNITS, LIKELY_EXTENT, likely_unit
+from .units import LENGTH_UNITS, LIKELY_EXTENT, PIXELS_ARE_NO_LENGTH, likely_unit
 
 MIN_EXTENT, MAX_EXTENT = 2e-3, 2.0
 """Smallest and largest extent of a sheet [m]: outside it the unit is wrong, or this is no tissue or cloth."""
@@ -163,7 +163,7 @@ def _frames_in_world(
     if np.isfinite(frames[0]).all(axis=1).sum() < MIN_REST_POINTS:
         raise RecordingError(f"the rest frame {names[0]} has fewer than three finite points; choose another rest.")
     _refuse_growth(frames)
-    _refuse_extent(frames[0], given)
+    _refuse_extent(frames[0], given, planar=is_planar(found.positions))
     return frames, names, [number - given.points.rest for number in order]
 
 
@@ -178,7 +178,7 @@ def _refuse_growth(frames: Float[np.ndarray, "t n 3"]) -> None:
         )
 
 
-def _refuse_extent(rest: Float[np.ndarray, "n 3"], given: MeasuredRecording) -> None:
+def _refuse_extent(rest: Float[np.ndarray, "n 3"], given: MeasuredRecording, *, planar: bool) -> None:
     extent = float(np.ptp(rest[np.isfinite(rest).all(axis=1)], axis=0).max())
     if MIN_EXTENT <= extent <= MAX_EXTENT:
         if given.noise_sd > MAX_NOISE_SHARE * extent:
@@ -191,7 +191,7 @@ def _refuse_extent(rest: Float[np.ndarray, "n 3"], given: MeasuredRecording) -> 
     cure = "check unit and columns" if likely is None else f'is it unit = "{likely}"?'
     raise RecordingError(
         f'the sheet is {extent:.3g} m large in unit = "{given.unit_name}"; {MIN_EXTENT:g} to {MAX_EXTENT:g} m is '
-        f"expected: {cure}"
+        f"expected: {cure}{f'; {PIXELS_ARE_NO_LENGTH}.' if planar else ''}"
     )
 
 
@@ -210,10 +210,7 @@ def _refuse_unit(found: PointFrames, given: MeasuredRecording) -> None:
     """Refuse a unit that contradicts that of headings or of the arrays' names."""
     other = next(iter(sorted(found.units - {given.unit_name})), None)
     if other == PIXELS:
-        raise RecordingError(
-            "headings or names of arrays say that the points are in pixels, which are no length. Give points in space, "
-            "from stereo or a depth camera; or, of a flat sheet seen from above, pixels times the mm of one."
-        )
+        raise RecordingError(f"headings or names of arrays say that the points are in pixels; {PIXELS_ARE_NO_LENGTH}.")
     if other is not None:
         cure = (
             f'give unit = "{other}"' if other in LENGTH_UNITS else f"convert them to one of {', '.join(LENGTH_UNITS)}"

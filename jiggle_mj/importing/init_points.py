@@ -1,6 +1,7 @@
 """Guess which files of a folder hold the tracked points, and how they are read."""
 
 import re
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,9 +13,11 @@ from .data_folder import DataFolder, quoted
 from .point_files import read_frames
 from .points.archives import array_shapes
 from .points.dic_formats import DIC_FORMATS
+from .points.file_kinds import file_kind
+from .points.measured import is_planar
 from .points.points_table import PointFiles
 from .points.visibility import as_visibility, may_say_visibility
-from .units import LENGTH_UNITS, LIKELY_EXTENT, PREFERRED_UNITS
+from .units import LENGTH_UNITS, LIKELY_EXTENT, PIXELS_ARE_NO_LENGTH, PREFERRED_UNITS
 
 ARCHIVES, FRAMES = (".npz", ".mat"), (".csv", ".txt", ".tsv", ".xyz", ".dat", ".ply", ".obj", ".pcd", ".asc", ".pts")
 """Endings of files that hold all frames, and of files that hold one each."""
@@ -61,6 +64,7 @@ def guess_points(folder: Path) -> GuessedPoints:
         found = _first_readable(folder, files, failures)
         if found is not None:
             return found
+    failures += _unread(folder, names)
     why = f" {failures[0]}" if failures else " None is of a known kind with at least two frames."
     raise RecordingError(
         f"{folder} holds no points that could be read without help: {len(names)} files.{why} Write {folder}/"
@@ -78,10 +82,12 @@ def guess_unit(points: GuessedPoints) -> tuple[str, str]:
         name = "headings say" if key is None else f"name {key} says"
         return unit, f"as the {name}; the sheet is {extent * LENGTH_UNITS[unit]:.3g} m large"
     low, high = LIKELY_EXTENT
+    pixels = f"; {PIXELS_ARE_NO_LENGTH}" if is_planar(points.positions) else ""
     for unit in PREFERRED_UNITS:
         if low <= extent * LENGTH_UNITS[unit] <= high:
-            return unit, f"guessed: the sheet is then {extent * LENGTH_UNITS[unit]:.3g} m large"
-    return "m", f"not known: the sheet is {extent:.3g} units large, which fits none of {', '.join(PREFERRED_UNITS)}"
+            return unit, f"guessed: the sheet is then {extent * LENGTH_UNITS[unit]:.3g} m large{pixels}"
+    units = ", ".join(PREFERRED_UNITS)
+    return "m", f"not known: the sheet is {extent:.3g} units large, which fits none of {units}{pixels}"
 
 
 def _finite(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
@@ -119,6 +125,17 @@ def _of_frames(names: list[str]) -> list[PointFiles]:
     several = [PointFiles(files=(key,)) for key, members in ordered if len(members) >= 2 and "[" not in key]
     alone = [PointFiles(files=(members[0],)) for _, members in ordered if len(members) == 1]
     return [*several, *alone]
+
+
+def _unread(folder: Path, names: list[str]) -> list[str]:
+    """Return why the files of the most frequent ending are of a kind that is not read; nothing where they are."""
+    endings = Counter(Path(name).suffix.lower() for name in names)
+    for ending, _ in endings.most_common(1):
+        try:
+            file_kind(folder / next(name for name in names if Path(name).suffix.lower() == ending))
+        except RecordingError as failure:
+            return [str(failure)]
+    return []
 
 
 def _first_readable(folder: Path, files: PointFiles, failures: list[str]) -> GuessedPoints | None:

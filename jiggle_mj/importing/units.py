@@ -12,6 +12,11 @@ PREFERRED_UNITS = ("m", "mm", "cm", "um")
 """Units of length in the order in which they are tried: cm are rare in exports, and um fit any place near 0."""
 LIKELY_EXTENT = (0.01, 0.5)
 """Extents of usual pieces of tissue and cloth, by which a unit is guessed, or offered as a cure [m]."""
+PIXELS_ARE_NO_LENGTH = (
+    "pixels are no length: give points in space from stereo or a depth camera, or, of a flat sheet seen from above, "
+    "pixels times the mm of one"
+)
+"""What to do with points of an image."""
 TIME_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Nanoseconds in one unit of time."""
 

@@ -19,6 +19,8 @@ BYTES_PER_POINT = 24
 """Three coordinates of 64 bits [bytes]."""
 SAVE_AS = "save the points as text, .npz, .npy, .ply, .obj or .pcd"
 """What to do with a file of another kind."""
+SAVE_MESH_AS = "save the mesh of each frame as .ply or .obj, whose vertices are the points, in one order"
+"""What to do with a mesh of another kind."""
 
 MAGIC: tuple[tuple[bytes, FileKind], ...] = (
     (b"\x93NUMPY", "npy"),
@@ -36,15 +38,21 @@ FOREIGN_MAGIC = (
     (b"\x80\x03", "a Python pickle, which can run code when it is read"),
     (b"\x80\x04", "a Python pickle, which can run code when it is read"),
     (b"\x80\x05", "a Python pickle, which can run code when it is read"),
-    (b"# vtk", "a VTK file"),
     (b"LASF", "a LAS cloud"),
-    (b"solid ", "an STL mesh, whose corners have no identity"),
     (b"\x89MCAP", "an MCAP recording, not a file of points"),
     (b"%PDF", "a PDF"),
 )
 """First bytes of kinds that are named when they are refused."""
+MESH_MAGIC = (
+    (b"# vtk", "a VTK file"),
+    (b"solid ", "an STL mesh, whose corners have no identity"),
+    (b"glTF", "a glTF mesh"),
+)
+"""First bytes of meshes that are named when they are refused."""
+MESH_SUFFIXES = frozenset(".stl .off .gltf .glb .vtk .vtp .vtu .fbx .dae .3ds".split())
+"""Names of meshes that are not read."""
 FOREIGN_SUFFIXES = frozenset(
-    ".stl .off .gltf .glb .vtk .vtp .vtu .las .laz .e57 .c3d .h5 .hdf5 .pkl .pickle .json .yaml .toml .parquet "
+    ".las .laz .e57 .c3d .h5 .hdf5 .pkl .pickle .json .yaml .toml .parquet "
     ".feather .bag .mcap .db3 .png .jpg .tif .tiff .mp4 .avi .zip .gz .xls .doc .html .xml".split()
 )
 """Names of files that hold no table of points, or not in a form that is read."""
@@ -94,6 +102,9 @@ def file_kind(path: Path) -> FileKind:
     for magic, what in FOREIGN_MAGIC:
         if head.startswith(magic):
             raise RecordingError(f"{path} is {what}; {SAVE_AS}.")
+    for magic, what in MESH_MAGIC:
+        if head.startswith(magic):
+            raise RecordingError(f"{path} is {what}; {SAVE_MESH_AS}.")
     return _kind_by_name(path, head)
 
 
@@ -105,6 +116,8 @@ def _kind_by_name(path: Path, head: bytes) -> FileKind:
         return "npz"
     if suffix in (".npz", ".npy", ".mat", ".ply"):
         raise RecordingError(f"{path} cannot be read as {suffix}: it does not begin as one; {SAVE_AS}.")
+    if suffix in MESH_SUFFIXES:
+        raise RecordingError(f"{path} is named {suffix}, a mesh that is not read; {SAVE_MESH_AS}.")
     if suffix in FOREIGN_SUFFIXES:
         raise RecordingError(f"{path} is named {suffix}, which is not read as points; {SAVE_AS}.")
     if suffix == ".pcd":

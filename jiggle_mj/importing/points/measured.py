@@ -90,6 +90,11 @@ def in_space(positions: Float[np.ndarray, "t n c"]) -> Float[np.ndarray, "t n 3"
     return np.where(np.isfinite(positions).all(axis=2, keepdims=True), positions, np.nan)
 
 
+def is_planar(positions: Float[np.ndarray, "t n 3"]) -> bool:
+    """Return whether z is 0 everywhere, as it is for points of two coordinates."""
+    return not np.nan_to_num(positions[:, :, 2]).any()
+
+
 def _moves(positions: Float[np.ndarray, "t n c"]) -> bool:
     """Return whether any point is at two places."""
     first = positions[0]

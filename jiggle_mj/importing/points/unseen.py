@@ -34,6 +34,13 @@ class MarkCheck:
             RecordingError: such a position is there; names frame, rows and place.
         """
         far = np.asarray((np.abs(np.nan_to_num(positions)) > MAX_COORDINATE).any(axis=2))
+        seen = np.isfinite(positions).all(axis=2)
+        all_far = far.any(axis=1) & (far == seen).all(axis=1)
+        if all_far.any():
+            raise RecordingError(
+                f"all points of {self.names[int(all_far.argmax())]} are more than {MAX_COORDINATE:g} from the origin, "
+                "as coordinates of a map are: subtract one offset from all coordinates of all frames."
+            )
         self._refuse_where(positions, far, "too far away for a point")
 
     def refuse_marks(self, positions: Float[np.ndarray, "t n 3"]) -> None:
@@ -47,11 +54,17 @@ class MarkCheck:
             RecordingError: such a position is there; names frame, rows and place.
         """
         for number, frame in enumerate(positions):
-            rows = _shared_place(frame)
-            if number == 0 and len(rows) == len(frame):
+            rows, n_places = _shared_place(frame)
+            if number == 0 and len(rows) > 2 and len(rows) == np.isfinite(frame).all(axis=1).sum():
                 raise RecordingError(
-                    f"{self.names[0]} has all points at one place: are these displacements? Give the reference "
-                    "coordinates as points, and these as displacements in [points]."
+                    f"all {len(rows)} points of {self.names[0]} are at exactly {_shown(frame[rows[0]])}, as "
+                    "displacements are: name the positions instead, and these as displacements, in [points]."
+                )
+            if n_places > 1:
+                raise RecordingError(
+                    f"{self.names[number]} has {n_places} places with several points each, such as "
+                    f"{_shown(frame[rows[0]])}: the coordinates are rounded (save more digits, or subtract a large "
+                    'offset first), or it holds several frames; if it is right, give missing = "none" in [points].'
                 )
             if len(rows):
                 self._refuse(number, frame[rows[0]], rows, "two points cannot be at one place")
@@ -95,22 +108,26 @@ class MarkCheck:
         listed = ", ".join(str(row) for row in rows[:MAX_LISTED_ROWS]) + (
             ", ..." if len(rows) > MAX_LISTED_ROWS else ""
         )
-        x, y, z = (f"{value:.9g}" for value in place)
         others = f" (the file has {quoted(', '.join(self.headings))})" if self.headings else ""
         raise RecordingError(
-            f"{self.names[number]} has {len(rows)} point{'s' * (len(rows) > 1)} at exactly ({x}, {y}, {z}), rows "
-            f"{listed} from 0: {why}. If that marks lost points, give missing = [{x}, {y}, {z}] in [points], or a "
-            f'rule as "COLUMN == -1"{others}; if it is right, missing = "none".'
+            f"{self.names[number]} has {len(rows)} point{'s' * (len(rows) > 1)} at exactly {_shown(place)}, rows "
+            f"{listed} from 0: {why}. If that marks lost points, give missing = [{_shown(place)[1:-1]}] in [points], "
+            f'or a rule as "COLUMN == -1"{others}; if it is right, missing = "none".'
         )
 
 
-def _shared_place(frame: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " r"]:
-    """Return the rows at the place that most points of a frame share exactly; none where no two do."""
+def _shown(place: Float[np.ndarray, " 3"]) -> str:
+    return f"({', '.join(f'{value:.9g}' for value in place)})"
+
+
+def _shared_place(frame: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " r"], int]:
+    """Return the rows at the place that most points of a frame share exactly, and the number of shared places."""
     rows = np.flatnonzero(np.isfinite(frame).all(axis=1))
     if len(rows) < 2:
-        return np.empty(0, np.int64)
+        return np.empty(0, np.int64), 0
     _, which, counts = np.unique(frame[rows], axis=0, return_inverse=True, return_counts=True)
-    return rows[which.ravel() == counts.argmax()] if counts.max() > 1 else np.empty(0, np.int64)
+    shared = rows[which.ravel() == counts.argmax()] if counts.max() > 1 else np.empty(0, np.int64)
+    return shared, int((counts > 1).sum())
 
 
 def _jump(positions: Float[np.ndarray, "t n 3"]) -> Float[np.ndarray, "t n"]:

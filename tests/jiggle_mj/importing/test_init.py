@@ -69,6 +69,26 @@ def test_an_array_of_lost_points_is_taken_as_its_opposite(tmp_path):
     assert import_folder(tmp_path, None, tmp_path / "run.mcap").n_unseen == 2
 
 
+def test_tracks_in_pixels_are_asked_for_what_they_lack(tmp_path):
+    np.savez(tmp_path / "d.npz", tracks=40 * frames()[:, :, :2])
+    description = describe_folder(tmp_path)
+    assert "pixels are no length" in description.text
+    assert "m is expected: " in description.problem and "pixels times the mm of one" in description.problem
+
+
+def test_pixels_by_name_are_no_points(tmp_path):
+    np.savez(tmp_path / "d.npz", tracks_px=10 * frames()[:, :, :2])
+    assert "in pixels" in describe_folder(tmp_path).problem
+
+
+@pytest.mark.parametrize("suffix", ["stl", "glb"])
+def test_a_folder_of_meshes_is_told_which_are_read(tmp_path, suffix):
+    for number in range(3):
+        (tmp_path / f"m{number}.{suffix}").write_bytes(b"glTF" + bytes(84))
+    with pytest.raises(RecordingError, match=r"save the mesh of each frame as \.ply or \.obj"):
+        describe_folder(tmp_path)
+
+
 def test_the_sample_is_what_init_writes_but_for_gravity_and_bed(tmp_path):
     for name in ("tracks.npz", "attached.txt"):
         shutil.copy(SAMPLE / name, tmp_path / name)

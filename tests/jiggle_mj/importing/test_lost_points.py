@@ -60,6 +60,22 @@ def test_points_at_one_place_are_refused_until_a_rule_names_it(tmp_path, mark):
     same(read(archive(tmp_path, f'key = "p"\nmissing = {list(mark)}', p=values)), lost())
 
 
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (sheet() - sheet()[0], r"all 12 points of d\.npz frame 0 are at exactly \(0, 0, 0\), as displacements"),
+        (
+            sheet() + np.array([5e5, 5e9, 0]),
+            "more than 1e.09 from the origin, as coordinates of a map are: subtract one offset",
+        ),
+        ((sheet() + np.array([0, 5e7, 0])).astype(np.float32), "the coordinates are rounded .*subtract a large offset"),
+    ],
+)
+def test_displacements_and_coordinates_of_a_map_are_named(tmp_path, values, message):
+    with pytest.raises(RecordingError, match=message):
+        read(archive(tmp_path, 'key = "p"', p=values))
+
+
 def test_one_point_that_jumps_to_the_origin_is_refused(tmp_path):
     values = sheet()
     values[2, 4] = 0

@@ -194,7 +194,7 @@ def test_a_list_in_the_order_of_names_is_kept_and_said(tmp_path):
         ('["packed.pcd"]', "write it as ascii or binary"),
         ('["bad.ply"]', r"cannot be read as \.ply: it declares 99999999999 elements"),
         ('["book.xlsx"]', "Office file"),
-        ('["mesh.stl"]', "is named .stl, which is not read"),
+        ('["mesh.stl"]', r"is named \.stl, a mesh that is not read; save .* as \.ply or \.obj"),
         ('["d.npy"]\ncolumns = [0, 1, 2]', "are for text files"),
     ],
 )

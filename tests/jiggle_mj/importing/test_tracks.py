@@ -113,7 +113,7 @@ def test_a_column_that_repeats_in_every_file_names_no_track(tmp_path):
         ("x,y,z\ncm,cm,cm", "{x},{y},{z}", 'in cm: give unit = "cm"'),
         ("X(mm),Y(mm),Z(cm)", "{x},{y},{z}", 'in cm: give unit = "cm"'),
         ("x [in],y [in],z [in]", "{x},{y},{z}", "in inches: convert them to one of m, cm, mm, um"),
-        ("x_px,y_px,z_px", "{x},{y},{z}", "in pixels, which are no length"),
+        ("x_px,y_px,z_px", "{x},{y},{z}", "in pixels; pixels are no length"),
     ],
 )
 def test_a_heading_that_contradicts_the_rows_or_the_unit_is_refused(tmp_path, heading, form, message):
