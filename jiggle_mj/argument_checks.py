@@ -30,7 +30,8 @@ def quoted(value: object) -> str:
     if isinstance(value, np.ndarray) and (value.ndim != 1 or value.size > 4):
         return f"an array of {value.dtype} {value.shape}"
     try:
-        text = repr(value.tolist() if isinstance(value, np.ndarray) else value)
+        short = value[:MAX_SHOWN] if isinstance(value, str | bytes) else value
+        text = repr(short.tolist() if isinstance(short, np.ndarray) else short)
     except Exception:
         text = f"a {type(value).__name__}"
     text = " ".join(text.split())

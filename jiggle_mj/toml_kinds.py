@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .errors import MAX_SHOWN, RecordingError
+from .argument_checks import quoted
+from .errors import RecordingError
 from .likely_name import did_you_mean, likeliest
 
 MAX_COUNT = (1 << 31) - 1
@@ -37,13 +38,13 @@ class StrictTable:
         if key not in self.values:
             if default is REQUIRED:
                 given = likeliest(key, set(self.values) - self.known, likeness=MISSPELT)
-                meant = "." if given is None else f"; did you write {shown(given)} for it?"
+                meant = "." if given is None else f"; did you write {quoted(given)} for it?"
                 raise RecordingError(f"{self.where} lacks the key '{key}'{meant}")
             return default
         try:
             return kind(self.values[key])
         except TypeError as failure:
-            raise RecordingError(f"{self.where} {key} must be {failure}; got {shown(self.values[key])}.") from failure
+            raise RecordingError(f"{self.where} {key} must be {failure}; got {quoted(self.values[key])}.") from failure
 
     def table(self, key: str, *, optional: bool = False) -> "StrictTable":
         """Return the table under a key; an optional table that is missing is empty."""
@@ -69,18 +70,9 @@ class StrictTable:
         unknown = sorted(set(self.values) - self.known)
         if unknown:
             raise RecordingError(
-                f"{self.where} has the unknown key {shown(unknown[0])}{did_you_mean(unknown[0], self.known)} Known: "
+                f"{self.where} has the unknown key {quoted(unknown[0])}{did_you_mean(unknown[0], self.known)} Known: "
                 f"{', '.join(sorted(self.known))}."
             )
-
-
-def shown(value: Any) -> str:
-    """Return a value as an error quotes it: at most `MAX_SHOWN` characters, on one line."""
-    try:
-        written = repr(value[:MAX_SHOWN] if isinstance(value, str | bytes) else value)
-    except (RecursionError, ValueError):
-        written = f"a {type(value).__name__} too large to show"
-    return written if len(written) <= MAX_SHOWN else written[:MAX_SHOWN] + "..."
 
 
 def text(value: Any) -> str:

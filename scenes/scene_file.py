@@ -11,10 +11,9 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from jiggle_mj.argument_checks import as_path
+from jiggle_mj.argument_checks import as_path, quoted
 from jiggle_mj.errors import MAX_SHOWN, SceneError
 from jiggle_mj.likely_name import did_you_mean
-from jiggle_mj.toml_kinds import shown
 
 from .disturbances.registry import disturbance_class
 from .scene.attachments import SHAPES, Attachment
@@ -105,10 +104,10 @@ def scene_from_table(table: dict[str, Any], *, name: str) -> Scene:
     _refuse_unknown(table, known, where="the scene")
     seed = table.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
-        raise SceneError(f"seed = {shown(seed)}: must be a whole number in [0, 2^32).")
+        raise SceneError(f"seed = {quoted(seed)}: must be a whole number in [0, 2^32).")
     secret = table.get("secret", False)
     if not isinstance(secret, bool):
-        raise SceneError(f"secret = {shown(secret)}: must be true or false.")
+        raise SceneError(f"secret = {quoted(secret)}: must be true or false.")
     sections = {key: _section(cls, table[key], where=key) for key, cls in SECTIONS.items() if key in table}
     shapes = tuple(_attachment(entry, where=where) for where, entry in _tables(table, "attachments"))
     disturbances = tuple(_disturbance(entry, where=where) for where, entry in _tables(table, "disturbances"))
@@ -119,10 +118,10 @@ def _tables(table: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, An
     """Yield the tables of an array, each with its place for messages."""
     entries = table.get(key, [])
     if not isinstance(entries, list):
-        raise SceneError(f"{key} = {shown(entries)}: must be an array of tables, each headed [[{key}]].")
+        raise SceneError(f"{key} = {quoted(entries)}: must be an array of tables, each headed [[{key}]].")
     for i, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            raise SceneError(f"{key}[{i}] = {shown(entry)}: must be a table headed [[{key}]].")
+            raise SceneError(f"{key}[{i}] = {quoted(entry)}: must be a table headed [[{key}]].")
         yield f"{key}[{i}]", entry
 
 
@@ -130,7 +129,7 @@ def _attachment(table: dict[str, Any], *, where: str) -> Attachment:
     shape = table.get("shape")
     if not isinstance(shape, str) or shape not in SHAPES:
         hint = did_you_mean(shape, SHAPES)
-        raise SceneError(f"{where}.shape = {shown(shape)}: must be one of {', '.join(map(repr, SHAPES))}{hint}")
+        raise SceneError(f"{where}.shape = {quoted(shape)}: must be one of {', '.join(map(repr, SHAPES))}{hint}")
     return _section(SHAPES[shape], {k: v for k, v in table.items() if k != "shape"}, where=where)
 
 
@@ -140,7 +139,7 @@ def _disturbance(table: dict[str, Any], *, where: str) -> Disturbance:
 
 def _section(cls: type[Section], table: object, *, where: str) -> Any:
     if not isinstance(table, dict):
-        raise SceneError(f"{where} = {shown(table)}: must be a table.")
+        raise SceneError(f"{where} = {quoted(table)}: must be a table.")
     _refuse_unknown(table, [f.name for f in fields(cls)], where=where)
     missing = [f.name for f in fields(cls) if f.default is MISSING and f.name not in table]
     if missing:
@@ -155,7 +154,7 @@ def _refuse_unknown(table: dict[str, Any], known: list[str], *, where: str) -> N
     unknown = [key for key in table if key not in known]
     if unknown:
         hint = did_you_mean(unknown[0], known)
-        raise SceneError(f"unknown key {shown(unknown[0])} in {where}{hint} Known keys are {', '.join(known)}.")
+        raise SceneError(f"unknown key {quoted(unknown[0])} in {where}{hint} Known keys are {', '.join(known)}.")
 
 
 def scene_table(scene: Scene) -> dict[str, Any]:

@@ -4,8 +4,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import RecordingError
-from ..toml_kinds import MAX_SHOWN
+from ..errors import MAX_SHOWN, RecordingError
 
 GLOB = re.compile(r"[*?\[]")
 """Characters that make a name a pattern."""

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from mcap.records import Attachment
 
+from ..argument_checks import quoted
 from ..errors import RecordingError
 from ..observation import MAX_PARTICLES, Declaration, DeclaredMesh
-from ..toml_kinds import MAX_COUNT, flag, number, positive, shown, vector
+from ..toml_kinds import MAX_COUNT, flag, number, positive, vector
 from .json_values import entry, parse_object
 from .mcap_files import McapOutput, read_arrays
 from .stored_arrays import StoredArrays
@@ -82,7 +83,7 @@ def parse_declaration(text: str) -> Declaration:
     values = parse_object(text, where)
     unknown = sorted(set(values) - set(KINDS))
     if unknown:
-        raise RecordingError(f"{where} has the unknown key {shown(unknown[0])}; known: {', '.join(KINDS)}.")
+        raise RecordingError(f"{where} has the unknown key {quoted(unknown[0])}; known: {', '.join(KINDS)}.")
     known = {name: entry(values, name, KINDS[name], where) for name in values}
     if "gravity" in known:
         known["gravity"] = tuple(known["gravity"])

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 
 from ..actions import Cut, Suture
+from ..argument_checks import quoted
 from ..errors import RecordingError
-from ..toml_kinds import number, positive, shown, text
+from ..toml_kinds import number, positive, text
 from .json_values import entry, parse_object
 from .topics import EVENT
 
@@ -53,7 +54,7 @@ def parse_event(data: bytes) -> Cut | Suture:
         return Cut(path=path, width=width)
     if kind == "suture":
         return Suture(path=path, width=width, stiffness=entry(value, "stiffness", positive, EVENT))
-    raise RecordingError(f"{EVENT} has kind = {shown(kind)}; it must be 'cut' or 'suture'.")
+    raise RecordingError(f"{EVENT} has kind = {quoted(kind)}; it must be 'cut' or 'suture'.")
 
 
 def _corners(value: Any) -> list[list[float]]:

@@ -4,8 +4,9 @@ import json
 from collections.abc import Callable
 from typing import Any
 
+from ..argument_checks import quoted
 from ..errors import RecordingError
-from ..toml_kinds import REQUIRED, shown
+from ..toml_kinds import REQUIRED
 
 MAX_JSON_BYTES = 1 << 26
 """Longest JSON text that is read [byte]: 64 MiB, some thousand times a usual one."""
@@ -26,9 +27,9 @@ def parse_object(data: bytes | str, where: str) -> dict[str, Any]:
     try:
         value = json.loads(data, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as failure:
-        raise RecordingError(f"{where} is not JSON ({failure}): {shown(data)}") from failure
+        raise RecordingError(f"{where} is not JSON ({failure}): {quoted(data)}") from failure
     if not isinstance(value, dict):
-        raise RecordingError(f"{where} is JSON, but no object {{...}}: {shown(data)}")
+        raise RecordingError(f"{where} is JSON, but no object {{...}}: {quoted(data)}")
     return value
 
 
@@ -40,12 +41,12 @@ def entry(values: dict[str, Any], key: str, kind: Callable[[Any], Any], where: s
     """
     if key not in values:
         if default is REQUIRED:
-            raise RecordingError(f"{where} lacks '{key}'; it has {shown(list(values))}.")
+            raise RecordingError(f"{where} lacks '{key}'; it has {quoted(list(values))}.")
         return default
     try:
         return kind(values[key])
     except TypeError as failure:
-        raise RecordingError(f"{where} has {key} = {shown(values[key])}; it must be {failure}.") from failure
+        raise RecordingError(f"{where} has {key} = {quoted(values[key])}; it must be {failure}.") from failure
 
 
 def parse_list(text: str, kind: Callable[[Any], Any], where: str) -> list[Any]:
@@ -56,7 +57,7 @@ def parse_list(text: str, kind: Callable[[Any], Any], where: str) -> list[Any]:
     """
     items = parse_object(f'{{"items": {text}}}', where)["items"]
     if not isinstance(items, list):
-        raise RecordingError(f"{where} must be a JSON list; got {shown(text)}.")
+        raise RecordingError(f"{where} must be a JSON list; got {quoted(text)}.")
     return [entry({"item": item}, "item", kind, where) for item in items]
 
 

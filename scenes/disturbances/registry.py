@@ -6,10 +6,9 @@ A disturbance has the name of the estimator's effect for it: the effect `gravity
 from collections.abc import Iterable
 from dataclasses import fields, replace
 
-from jiggle_mj.argument_checks import as_instance
+from jiggle_mj.argument_checks import as_instance, quoted
 from jiggle_mj.errors import SceneError
 from jiggle_mj.likely_name import did_you_mean
-from jiggle_mj.toml_kinds import shown
 
 from ..scene.disturbance import Disturbance
 from ..scene.scene import Scene
@@ -81,7 +80,7 @@ def disturbance_class(name: object) -> type[Disturbance]:
         raise SceneError('a disturbance lacks its name; write for example name = "gravity".')
     if not isinstance(name, str) or name not in DISTURBANCES:
         hint = did_you_mean(name, DISTURBANCES)
-        raise SceneError(f"no disturbance named {shown(name)}{hint} There are {', '.join(DISTURBANCES)}.")
+        raise SceneError(f"no disturbance named {quoted(name)}{hint} There are {', '.join(DISTURBANCES)}.")
     return DISTURBANCES[name]
 
 

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, ClassVar
 
+from jiggle_mj.argument_checks import quoted
 from jiggle_mj.errors import SceneError
 from jiggle_mj.toml_kinds import number as number_of
-from jiggle_mj.toml_kinds import shown
 
 Check = Callable[[object], Any]
 """Function that returns the value in its stored type, or raises ValueError with what is allowed."""
@@ -174,4 +174,4 @@ def checked(f: Field[Any], value: object, *, where: str) -> Any:
     try:
         return f.metadata["check"](value)
     except ValueError as error:
-        raise SceneError(f"{where}.{f.name} = {shown(value)}: must be {error}.") from None
+        raise SceneError(f"{where}.{f.name} = {quoted(value)}: must be {error}.") from None

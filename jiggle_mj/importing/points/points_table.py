@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ... import toml_kinds as kinds
+from ...argument_checks import quoted
 from ...errors import RecordingError
 from ...toml_kinds import StrictTable
 from .dic_formats import DIC_FORMATS, OTHER_DIC_PROGRAMS
@@ -103,12 +104,10 @@ def _refuse_contradictions(points: PointFiles, where: str) -> None:
         raise RecordingError(f"{where} needs at least one file.")
     if points.key is not None and not archive:
         raise RecordingError(
-            f"{where} key names the array of an .npz or .mat, and only that; files are {kinds.shown(points.files)}."
+            f"{where} key names the array of an .npz or .mat, and only that; files are {quoted(points.files)}."
         )
     if not archive and (points.runs or points.visibility):
-        raise RecordingError(
-            f"{where} runs and visibility name arrays of an .npz; files are {kinds.shown(points.files)}."
-        )
+        raise RecordingError(f"{where} runs and visibility name arrays of an .npz; files are {quoted(points.files)}.")
     if points.times and points.rest:
         raise RecordingError(f"{where} rest must be 0 where frames have times; got {points.rest}.")
     if points.runs and not points.times:
@@ -122,7 +121,7 @@ def _refuse_contradictions(points: PointFiles, where: str) -> None:
     if points.separator is not None and points.separator == points.decimal:
         raise RecordingError(f"{where} separator and decimal are both '{points.separator}'; they must differ.")
     if points.layout not in (None, FRAMES_FIRST) and not archive and not points.files[0].endswith(".npy"):
-        raise RecordingError(f"{where} layout is for arrays (.npz, .npy, .mat); files are {kinds.shown(points.files)}.")
+        raise RecordingError(f"{where} layout is for arrays (.npz, .npy, .mat); files are {quoted(points.files)}.")
     if points.format is not None and points.format not in DIC_FORMATS:
         hint = OTHER_DIC_PROGRAMS.get(points.format)
         known = ", ".join(DIC_FORMATS)
