@@ -70,13 +70,10 @@ def test_a_compressed_image_has_the_camera_info_of_its_namespace():
     assert guess(found)[0]["left_info"] == "/a/left/camera_info"
 
 
-def test_two_equal_candidates_are_listed_and_neither_is_taken():
-    chosen, unsure = guess(topics(PSM1__measured_cp=POSE, PSM2__measured_cp=POSE))
-    assert "tool" not in chosen and unsure["tool"] == ["/PSM1/measured_cp", "/PSM2/measured_cp"]
-
-
-def test_a_named_topic_goes_before_every_guess():
+def test_of_two_equal_candidates_neither_is_taken_unless_it_is_named():
     found = topics(PSM1__measured_cp=POSE, PSM2__measured_cp=POSE)
+    chosen, unsure = guess(found)
+    assert "tool" not in chosen and unsure["tool"] == ["/PSM1/measured_cp", "/PSM2/measured_cp"]
     assert guess(found, tool="/PSM2/measured_cp")[0]["tool"] == "/PSM2/measured_cp"
     assert guess(found, tool="tf:tip")[0]["tool"] == "tf:tip"
 
