@@ -42,7 +42,9 @@ def read_pcd(path: Path) -> Float[np.ndarray, "n 3"]:
         if kind == "ascii":
             return _text(body, fields, counts, points)
         if kind != "binary":
-            raise RecordingError(f"{path} has DATA {quoted(kind)}; write it as ascii or binary.")
+            raise RecordingError(
+                f"{path} has DATA {quoted(kind)}; write it as ascii or binary: pcl_convert_pcd_ascii_binary IN OUT 1."
+            )
         letters = [KINDS[letter.upper()] for letter in header["TYPE"]]
         record = np.dtype(
             [
