@@ -14,7 +14,7 @@ from ..camera import StereoCamera
 
 MAX_FEATURES = 1000
 """Most features of an image, the strongest."""
-WORKING_WIDTH = 640
+WORKING_WIDTH = 1280
 """Wider images are halved until they are not wider [px]: it bounds the time."""
 RATIO = 0.8
 """Largest ratio of the distances to the best and second-best match (Lowe 2004, section 7.1)."""
