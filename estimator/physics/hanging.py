@@ -40,7 +40,7 @@ class Tension(Triangles):
         plane = np.stack([np.cross(_normal(mesh), down), down], axis=1)
         B = _strain_matrix(mesh, membrane, plane)
         weights = np.asarray(membrane.area)[:, None, None] * np.asarray(membrane.elasticity)
-        K = B.T @ sp.block_diag(weights, format="csr") @ B
+        K = B.T @ sp.block_diag([sp.coo_array(each) for each in weights], format="csr") @ B
         stiffest = K.diagonal().max()
         K += sp.diags_array(np.repeat(np.where(top, stiffest, TETHER_STIFFNESS * stiffest), 2))
         u = spsolve(K.tocsc(), (np.asarray(weight.force) @ plane).ravel())

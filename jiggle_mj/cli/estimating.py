@@ -282,7 +282,7 @@ def score(
     """
     from jiggle_mj.eval.runs.experiment import score_directory
 
-    if not truth.exists():
+    if directory.exists() and not truth.exists():
         raise RecordingError(f"{truth} does not exist; 'import' writes one where recording.toml has a [truth].")
     figures = score_directory(directory, truth, recording=recording, allow_truncated=allow_truncated, log=console.print)
     show(figures, directory, as_json)

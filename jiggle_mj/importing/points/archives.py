@@ -7,10 +7,9 @@ import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import BytesIO
+from io import BufferedIOBase, BytesIO
 from lzma import LZMAError
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from jaxtyping import Shaped
@@ -163,7 +162,7 @@ def _read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
         return _plain_array(stream)
 
 
-def _plain_array(stream: IO[bytes]) -> Shaped[np.ndarray, "..."]:
+def _plain_array(stream: BufferedIOBase) -> Shaped[np.ndarray, "..."]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # see _header
         return npy_format.read_array(stream, allow_pickle=False)

@@ -57,8 +57,8 @@ class MarkCheck:
             rows, n_places = _shared_place(frame)
             if number == 0 and len(rows) > 2 and len(rows) == np.isfinite(frame).all(axis=1).sum():
                 raise RecordingError(
-                    f"all {len(rows)} points of {self.names[0]} are at exactly {_shown(frame[rows[0]])}, as "
-                    "displacements are: name the positions instead, and these as displacements, in [points]."
+                    f"all {len(rows)} points of {self.names[0]} are at exactly {_shown(frame[rows[0]])}: are these "
+                    "displacements? Give the reference coordinates as points, and these as displacements in [points]."
                 )
             if n_places > 1:
                 raise RecordingError(

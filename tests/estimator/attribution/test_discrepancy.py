@@ -37,6 +37,7 @@ def test_the_result_is_written_before_a_pull_is_searched_for(light, tmp_path, mo
         raise KeyboardInterrupt
 
     monkeypatch.setattr(closing_run.Recording, "open", staticmethod(lambda *_, **__: recording))
+    monkeypatch.setattr(closing_run, "check_before", lambda *_, **__: None)
     monkeypatch.setattr(closing_run, "collect_dataset", lambda *_, **__: dataset)
     monkeypatch.setattr(closing_run, "close_the_loop", lambda *_, **__: closed)
     monkeypatch.setattr(closing_run, "suggest", stopped)
