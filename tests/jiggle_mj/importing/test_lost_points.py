@@ -63,7 +63,7 @@ def test_points_at_one_place_are_refused_until_a_rule_names_it(tmp_path, mark):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (sheet() - sheet()[0], r"all 12 points of d\.npz frame 0 are at exactly \(0, 0, 0\), as displacements"),
+        (sheet() - sheet()[0], r"all 12 points of d\.npz frame 0 are at exactly \(0, 0, 0\): are these displacements"),
         (
             sheet() + np.array([5e5, 5e9, 0]),
             "more than 1e.09 from the origin, as coordinates of a map are: subtract one offset",
