@@ -87,6 +87,8 @@ class RowKeys:
             if len(set(labels)) < 2:
                 continue
             heading = quoted(self.names[column])
+            if not alone and self.names[column] == self.time_heading and not _rise(labels):
+                continue  # a value of each point that is headed t, such as its temperature
             if not alone:
                 raise RecordingError(
                     f"{rows.name} has several values in the column '{heading}', and there are further files: give one "
@@ -108,6 +110,14 @@ class RowKeys:
             if len(np.unique(frame.values[:, -1])) != 1:
                 raise RecordingError(f"{frame.name} has several times in '{quoted(self.names[self.times])}'.")
         return np.array([frame.values[0, -1] for frame in frames])
+
+
+def _rise(labels: list[str]) -> bool:
+    """Return whether labels are numbers that never fall, as the times of rows in turn."""
+    try:
+        return bool((np.diff([float(label) for label in labels]) >= 0).all())
+    except ValueError:
+        return False
 
 
 def _numbers(labels: list[str], where: str) -> Float[np.ndarray, " n"]:

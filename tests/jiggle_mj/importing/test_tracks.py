@@ -25,9 +25,13 @@ def orders() -> list[list[int]]:
     return [list(range(12)), rng.permutation(12).tolist(), rng.permutation(12).tolist()]
 
 
+TIMES = [f"{0.5 * number:g}" for number in range(12)]
+"""Times of the rows of the first frame."""
+
+
 def line(point: int, frame: int, form: str) -> str:
     x, y, z = frames()[frame, point]
-    return form.format(frame=frame, time=f"{0.25 * frame:g}", point=point, x=x, y=y, z=z)
+    return form.format(frame=frame, time=f"{0.25 * frame:g}", point=point, point_time=TIMES[point], x=x, y=y, z=z)
 
 
 def long_table(tmp_path, heading: str, form: str, *, keys: str = "", lost=()):
@@ -101,9 +105,18 @@ def test_a_column_that_repeats_in_every_file_names_no_track(tmp_path):
     assert summary.notes == ("x, y and z are columns [1, 2, 3], by the heading",)
 
 
+def test_a_value_of_each_point_that_is_headed_t_is_no_time(tmp_path):
+    where = folder(tmp_path)
+    for number, name in enumerate(NAMES):
+        rows = [f"{x},{y},{z},{300 - (7 * k) % 5}" for k, (x, y, z) in enumerate(frames()[number])]
+        (where / name).write_text("\n".join(["x,y,z,T", *rows]))
+    np.testing.assert_allclose(positions(bring_in(where)[1]), frames(), atol=1e3 * ROUNDING)
+
+
 @pytest.mark.parametrize(
     ("heading", "form", "message"),
     [
+        ("t,x,y,z", "{point_time},{x},{y},{z}", "several values in the column 't', and there are further files"),
         ("frame,x,y,z", "{point},{x},{y},{z}", "several values in the column 'frame', and there are further files"),
         ("id,x,y,z", "{frame}{point:02d},{x},{y},{z}", "no id is in two frames"),
         ("id,x,y,z", "{frame},{x},{y},{z}", "has the id '0' in several rows.*track_column = \"none\""),
