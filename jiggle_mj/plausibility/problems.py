@@ -7,7 +7,6 @@ without a word. docs/RECORDINGS.md has them as a table.
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ..camera import MAX_BASELINE_M
 from .problem import RecordingProblem, metres, seconds
 from .survey import Survey
 
@@ -26,9 +25,9 @@ DOUBTED_GAP_SHARE = 0.5
 not move together: a tool that turns or slips still pulls its own way."""
 NOISE_MULTIPLES = 3.0
 """Motion that is noise, and ratio of declared to measured noise that is doubted: three standard deviations."""
-REFUSED_BASELINE_M, DOUBTED_BASELINE_M = (1e-4, MAX_BASELINE_M), (1e-3, 0.5)
-"""Distance between the cameras [m]: a stereo endoscope has 4 to 6 mm, a wide bench rig 0.3 m; above 1 m it is a length
-in millimetres."""
+MIN_BASELINE_M, DOUBTED_BASELINE_M = 1e-4, (1e-3, 0.5)
+"""Distance between the cameras [m]: a stereo endoscope has 4 to 6 mm, a wide bench rig 0.3 m. `StereoCamera` refuses
+one above 1 m."""
 MAX_DISPARITY_SHARE = 0.5
 """Largest disparity at the tool that can be matched [image width], the search range of `SemiGlobalMatching`."""
 MAX_DEPTH_M = 10.0
@@ -121,12 +120,11 @@ def _camera(survey: Survey) -> Iterator[RecordingProblem]:
     baseline, size = survey.baseline_m, survey.image_size
     if baseline is None or size is None:
         return
-    if not _within(baseline, REFUSED_BASELINE_M):
+    if baseline < MIN_BASELINE_M:
         yield _refuse(
             "baseline",
-            f"the cameras are {metres(baseline)} apart; {metres(REFUSED_BASELINE_M[0])} to "
-            f"{metres(REFUSED_BASELINE_M[1])} can be. The right P[0,3] is -fx * baseline in px m: divide it by 1000 if "
-            "the calibration was made in millimetres.",
+            f"the cameras are {metres(baseline)} apart; {metres(MIN_BASELINE_M)} or more can be. The right P[0,3] is "
+            "-fx * baseline in px m: was it divided by 1000 though it was in metres?",
         )
         return
     if not _within(baseline, DOUBTED_BASELINE_M):
