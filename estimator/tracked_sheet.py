@@ -45,8 +45,7 @@ class TrackedSheet:
         Raises:
             MeshError: the sheet is folded, or not one sheet.
         """
-        mesh, plane = SheetMesh(sheet.rest, sheet.faces), SheetPlane.through(sheet.rest)
-        check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
+        mesh, plane = unfolded(sheet)
         filter = build_filter(mesh, declaration, config)
         state = filter.init(jax.random.key(config.seed))
         return cls(
@@ -58,3 +57,14 @@ class TrackedSheet:
             x=mesh.rest,
             open_x=mesh.rest,
         )
+
+
+def unfolded(sheet: Sheet) -> tuple[SheetMesh, SheetPlane]:
+    """Return the mesh of a sheet at rest, and its plane.
+
+    Raises:
+        MeshError: the sheet is folded, or not one sheet.
+    """
+    mesh, plane = SheetMesh(sheet.rest, sheet.faces), SheetPlane.through(sheet.rest)
+    check_unfolded(mesh.rest, mesh.faces, above=plane.axes[2])
+    return mesh, plane

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from ..errors import RecordingError
+from ..errors import JiggleError, MeshError, PerceptionError, RecordingError
 from ..plausibility.check import refuse_implausible
 from ..plausibility.problem import metres, seconds
 from ..plausibility.survey import Survey, survey
@@ -25,18 +25,25 @@ def show_survey(path: Path) -> Survey:
     A recording that is refused is removed, with its truth.
 
     Raises:
-        RecordingError: the recording cannot be read, or is implausible.
+        RecordingError: the recording cannot be read, is implausible, or its points show no sheet at rest.
     """
+    from jiggle_mj.estimator.rest_check import check_rest
+
     try:
-        surveyed = survey(Recording.open(path))
+        recording = Recording.open(path)
+        surveyed = survey(recording)
         table = Table("surveyed", "", box=None)
         for name, value in rows(surveyed):
             table.add_row(name, value)
         console.print(table)
         refuse_implausible(surveyed, path, log=doubt)
-    except RecordingError:
+        if recording.camera is None:
+            check_rest(recording.without_images(), recording.declaration)
+    except JiggleError as failure:
         for written in (path, truth_path(path)):
             written.unlink(missing_ok=True)
+        if isinstance(failure, PerceptionError | MeshError):
+            raise RecordingError(f"{path}: its points at rest are not one sheet: {failure}") from failure
         raise
     return surveyed
 

@@ -141,7 +141,7 @@ def _refuse_still(
     cure = (
         "give each pull its own [[grasp]] with its rows, or at and radius, and run, begin and end, or frames"
         if len(set(clock.runs)) > 1 or several
-        else "check rows, after and the tool's clock; where there are several pulls, give each its own [[grasp]]"
+        else "check rows or radius, after and the tool's clock; of several pulls, give each its own [[grasp]]"
     )
     raise RecordingError(
         f"{grasp.what}: {still} of {len(share)} held points stand still while {leader} went "

@@ -41,6 +41,8 @@ MAX_TOOL_SPEED_M_S = 5.0
 """Speed of the tool that is doubted [m/s]: robot arms reach 2 m/s."""
 MAX_UNSEEN = 0.5
 """Share of unseen points that is doubted."""
+MAX_HELD = 0.5
+"""Share of the sheet in the grip that is doubted: attachments show in points that are not held."""
 
 
 def problems(survey: Survey) -> tuple[RecordingProblem, ...]:
@@ -56,6 +58,9 @@ def _use(survey: Survey) -> Iterator[RecordingProblem]:
         yield _refuse(
             "no-frame", f"none of the {survey.skipped} frames can be used; the first one: {survey.first_skipped}."
         )
+        return
+    if survey.frames == 1 and not survey.mesh_declared:
+        yield _refuse("one-frame", "one frame only, in which nothing moves; give those of a pull, the first at rest.")
         return
     if not survey.closed_frames:
         yield _refuse(
@@ -74,6 +79,13 @@ def _use(survey: Survey) -> Iterator[RecordingProblem]:
         named = ", ".join(map(str, survey.missing_tracks[:5]))
         text = f"held tracks that no point has: {named}; give the numbers as in the points' track_id."
         yield _problem("held-tracks", text, refuses=survey.held_motion_m is None)
+    if survey.grip_share is not None and survey.grip_share > MAX_HELD:
+        yield _problem(
+            "grip-share",
+            f"the tool holds {survey.grip_share:.0%} of the sheet's points; is the radius of the grip in metres, and "
+            "are the held rows right?",
+            refuses=survey.grip_share == 1,
+        )
     if survey.unseen is not None and survey.unseen > MAX_UNSEEN:
         yield _warn("unseen", f"{survey.unseen:.0%} of the points are not seen; is a missing value read as such?")
 

@@ -13,6 +13,7 @@ from ..camera import StereoCamera
 from ..observation import ToolState
 from ..recording.reader import Recording
 from .closed_tool import NS, ClosedTool
+from .grip_share import grip_share
 from .held_motion import HeldMotion
 from .image_problems import image_problems
 from .increments import SummedMotion
@@ -55,6 +56,8 @@ class Survey:
     """Largest distance of the points from where they were first; 95th percentile over the points [m]."""
     held_motion_m: float | None
     """Largest mean displacement of the held points since the jaws closed [m]."""
+    grip_share: float | None
+    """Largest share of the sheet's points, or of the declared mesh's vertices, that the tool holds."""
     missing_tracks: tuple[int, ...]
     """Held tracks that no point has."""
     grasps: int
@@ -96,6 +99,8 @@ class Survey:
     images."""
     declared: bool
     """Whether the recording declares the tissue; else the defaults hold."""
+    mesh_declared: bool
+    """Whether it declares the sheet's mesh at rest; else the first frames show it."""
 
 
 def survey(recording: Recording) -> Survey:
@@ -105,7 +110,7 @@ def survey(recording: Recording) -> Survey:
         recording: an open recording; iterating it anew afterwards begins at its first frame.
     """
     motion, closed, times, track = PointMotion(), ClosedTool(), list[int](), HeldMotion()
-    summed = SummedMotion()
+    summed, shares, mesh = SummedMotion(), list[float](), recording.declaration.mesh
     tools: list[tuple[int, ToolState]] = []
     stride = max(1, len(recording) // COMPARED_FRAMES)
     first_cloud: Float[np.ndarray, "m 3"] | None = None
@@ -119,6 +124,7 @@ def survey(recording: Recording) -> Survey:
             declared_sd = points.sd if declared_sd is None else declared_sd
             identified |= points.track_id is not None
             if closed.begins(observation):
+                shares.append(grip_share(observation.tool, points, mesh))
                 closed.distances.append(
                     nearest_distance(points.positions, observation.tool.position)
                     if points.track_id is None
@@ -169,6 +175,7 @@ def survey(recording: Recording) -> Survey:
         unseen=1 - motion.n_seen / motion.n_expected if motion.n_expected else None,
         points_motion_m=motion.largest if motion.n_expected else None,
         held_motion_m=closed.held,
+        grip_share=max(shares, default=None),
         missing_tracks=motion.missing_tracks,
         grasps=len(closed.grasps),
         closed_frames=closed.frames,
@@ -189,6 +196,7 @@ def survey(recording: Recording) -> Survey:
         tool_in_view=in_view,
         doubts=(*doubts, *point_problems(motion.identity, summed), *image_problems(recording, tools)),
         declared=recording.declared,
+        mesh_declared=mesh is not None,
     )
 
 

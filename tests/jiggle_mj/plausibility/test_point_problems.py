@@ -34,7 +34,14 @@ def lifted(sd: float = SD) -> np.ndarray:
     return REST + up + np.random.default_rng(3).normal(scale=sd, size=up.shape)
 
 
-def found(tmp_path, positions: np.ndarray, *, tracks: list[np.ndarray] | None = None, sd: float = SD):
+def found(
+    tmp_path,
+    positions: np.ndarray,
+    *,
+    tracks: list[np.ndarray] | None = None,
+    sd: float = SD,
+    radius: float | None = None,
+):
     """Return the survey and the names of what refuses and what is doubted, but that there is one grasp."""
     tip = REST[list(HELD)].mean(axis=0)
     with RecordingWriter(
@@ -52,8 +59,8 @@ def found(tmp_path, positions: np.ndarray, *, tracks: list[np.ndarray] | None = 
                         quat_wxyz=IDENTITY_WXYZ,
                         closed=closed,
                         grasp=int(closed),
-                        radius=2e-3,
-                        held_tracks=HELD if closed else (),
+                        radius=radius or 2e-3,
+                        held_tracks=HELD if closed and radius is None else (),
                     ),
                     points=MeasuredPoints(positions=points[rows], track_id=rows, sd=sd),
                 )
@@ -61,6 +68,19 @@ def found(tmp_path, positions: np.ndarray, *, tracks: list[np.ndarray] | None = 
     surveyed = survey(Recording.open(tmp_path / "run.mcap"))
     listed = [each for each in problems(surveyed) if each.name != "one-grasp"]
     return surveyed, {each.name for each in listed if each.refuses}, {each.name for each in listed if not each.refuses}
+
+
+@pytest.mark.parametrize(
+    ("radius", "refused", "doubted"), [(1.0, True, False), (0.04, False, True), (6e-3, False, False)]
+)
+def test_a_grip_as_large_as_the_sheet_is_named(tmp_path, radius, refused, doubted):
+    """The sheet is 55 x 45 mm, and held at a corner."""
+    _, refuses, doubts = found(tmp_path, lifted(), radius=radius)
+    assert ("grip-share" in refuses, "grip-share" in doubts) == (refused, doubted)
+
+
+def test_one_frame_is_refused(tmp_path):
+    assert found(tmp_path, lifted()[:1])[1] == {"one-frame"}
 
 
 def changed(edit: Callable[[np.ndarray], None]) -> np.ndarray:
