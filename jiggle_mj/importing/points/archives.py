@@ -7,7 +7,7 @@ import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import BufferedIOBase, BytesIO
+from io import BytesIO
 from lzma import LZMAError
 from pathlib import Path
 
@@ -145,8 +145,8 @@ def _read_npz(path: Path, key: str) -> Shaped[np.ndarray, "..."]:
         info = archive.getinfo(f"{key}.npy")
         with archive.open(info) as stream:
             _refuse_large(path, key, stream.read(HEADER_BYTES), info.file_size)
-        with archive.open(info) as stream:
-            return _plain_array(stream)
+        with archive.open(info) as stream, _header_of_any_python():
+            return npy_format.read_array(stream, allow_pickle=False)
 
 
 def _read_mat(path: Path, key: str) -> Shaped[np.ndarray, "..."]:
@@ -159,13 +159,16 @@ def _read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     with path.open("rb") as stream:
         _refuse_large(path, "the array", stream.read(HEADER_BYTES), path.stat().st_size)
         stream.seek(0)
-        return _plain_array(stream)
+        with _header_of_any_python():
+            return npy_format.read_array(stream, allow_pickle=False)
 
 
-def _plain_array(stream: BufferedIOBase) -> Shaped[np.ndarray, "..."]:
+@contextmanager
+def _header_of_any_python() -> Iterator[None]:
+    """Read a header of Python 2 without the warning; what else it may hold is refused."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # see _header
-        return npy_format.read_array(stream, allow_pickle=False)
+        warnings.simplefilter("ignore")
+        yield
 
 
 def _refuse_large(path: Path, name: str, head: bytes, n_bytes: int) -> None:
@@ -195,8 +198,7 @@ def _header(head: bytes) -> tuple[tuple[int, ...], np.dtype] | None:
         reader = HEADERS.get(npy_format.read_magic(stream))
         if reader is None:
             return None
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a header of Python 2, which is read as well
+        with _header_of_any_python():
             shape, _, dtype = reader(stream)
     except ValueError:
         return None

@@ -73,12 +73,13 @@ def test_tracks_in_pixels_are_asked_for_what_they_lack(tmp_path):
     np.savez(tmp_path / "d.npz", tracks=40 * frames()[:, :, :2])
     description = describe_folder(tmp_path)
     assert "pixels are no length" in description.text
-    assert "m is expected: " in description.problem and "pixels times the mm of one" in description.problem
+    problem = str(description.problem)
+    assert "m is expected: " in problem and "pixels times the mm of one" in problem
 
 
 def test_pixels_by_name_are_no_points(tmp_path):
     np.savez(tmp_path / "d.npz", tracks_px=10 * frames()[:, :, :2])
-    assert "in pixels" in describe_folder(tmp_path).problem
+    assert "in pixels" in str(describe_folder(tmp_path).problem)
 
 
 @pytest.mark.parametrize("suffix", ["stl", "glb"])
