@@ -32,10 +32,12 @@ MALFORMED = (
     RecursionError,
     MemoryError,
     SyntaxError,
+    SystemError,
     struct.error,
     tokenize.TokenError,
 )
-"""What `zipfile` and numpy raise on bytes that are no archive, or on a header that is no header."""
+"""What `zipfile` and numpy raise on bytes that are no archive, or on a header that is no header; Python 3.12's
+tokenizer, which numpy uses, ends in a SystemError there."""
 
 
 def read_npz(data: bytes, *, limit: int = MAX_ARRAYS_BYTES) -> dict[str, np.ndarray]:

@@ -61,6 +61,11 @@ def npz(member: bytes) -> bytes:
     return buffer.getvalue()
 
 
+NUL_IN_HEADER = header("(2, 12, 3)").replace(b"{'descr':", b" " * 9).replace(b"\x76\x00", b"\x7e\x00") + bytes(600)
+"""An array whose header closes a brace that it never opened, and goes on: Python 3.12's tokenizer ends in a
+SystemError."""
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
@@ -73,8 +78,9 @@ def npz(member: bytes) -> bytes:
         (npz(b"\x80\x04K\x01."), "has no array 'p'"),
         (npz(header("(2, 12, 3)") + bytes(576))[:-40], r"cannot be read as \.npz"),
         (header("(2, 12, 3)"), "has no array|ends before"),
+        (npz(NUL_IN_HEADER), "has no array|cannot be read|does not begin as an array"),
     ],
-    ids=["terabytes", "digits", "bomb", "short", "objects", "negative", "pickle", "cut-off", "no-archive"],
+    ids=["terabytes", "digits", "bomb", "short", "objects", "negative", "pickle", "cut-off", "no-archive", "NUL"],
 )
 def test_what_an_archive_declares_is_checked_before_it_is_read(tmp_path, data, message):
     where = folder(tmp_path, toml=TOML.replace(FILES, 'files = ["d.npz"]\nkey = "p"'))
