@@ -174,7 +174,7 @@ def _refuse_many(length: float, width: float, spacing: float) -> None:
     if not count <= MAX_PARTICLES:
         raise MeshError(
             f"a sheet of {width:.3g} x {length:.3g} m at a spacing of {spacing:.3g} m has about {count:.3g} vertices; "
-            f"at most {MAX_PARTICLES} are allowed: give a larger spacing."
+            f"at most {MAX_PARTICLES} are allowed: give a larger spacing, or lengths in m."
         )
 
 

@@ -7,8 +7,8 @@ from math import isnan
 from typing import Annotated, Literal
 
 import tyro
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from .options import AsJson, Disturb, Name
 from .terminal import FAILED, console, log
@@ -79,7 +79,7 @@ def scene_check(scene: Name, /, *, disturb: Disturb = (), as_json: AsJson = Fals
         table.add_row(name.replace("_", " "), unit, f"{getattr(nominal, name):.4g}", *ratios)
     console.print(table)
     for line in far_from_declared(scene_to_test, measured):
-        console.print(line, style="yellow", markup=False, highlight=False)
+        console.print(line, style="yellow", highlight=False)
     if as_json:
         plain = [{key: None if isnan(value) else value for key, value in asdict(test).items()} for test in measured]
         print(json.dumps({"typed": asdict(nominal), "effective": plain}))
@@ -100,9 +100,8 @@ def doctor(*, as_json: AsJson = False) -> None:
     checks = run_checks()
     table = Table("", "check", "found", "what to do", box=None)
     for check in checks:
-        table.add_row(
-            "[green]ok[/]" if check.ok else "[red]no[/]", check.name, escape(check.detail), escape(check.remedy)
-        )
+        ok = Text("ok", "green") if check.ok else Text("no", "red")
+        table.add_row(ok, check.name, check.detail, check.remedy)
     console.print(table)
     ready = can_run(checks)
     console.print(verdict(checks), style="bold" if ready else "bold red", highlight=False, soft_wrap=True)

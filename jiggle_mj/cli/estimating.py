@@ -251,11 +251,11 @@ def close_loop(
             tolerance_ns=tolerance_ns,
             overwrite=overwrite,
             on_frame=on_frame,
-            log=lambda text: console.print(text, highlight=False, markup=False),
+            log=lambda text: console.print(text, highlight=False),
         )
     console.print(discrepancy["verdict"], style="bold")
     for sentence in story(discrepancy):
-        console.print(sentence, highlight=False, markup=False)
+        console.print(sentence, highlight=False)
     console.print(f"report: {out / PAGE}")
     if as_json:
         print(json.dumps(discrepancy))

@@ -121,8 +121,8 @@ def inspect(
     console.print(f"{path}: a {report.kind}")
     console.print(table)
     for lack in report.missing:
-        console.print(f"missing: {lack}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"next: {report.next_command}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"missing: {lack}", highlight=False, soft_wrap=True)
+    console.print(f"next: {report.next_command}", highlight=False, soft_wrap=True)
     if as_json:
         print(json.dumps(asdict(report), default=str))
 
@@ -142,9 +142,9 @@ def _import_bag(path: Path, out: Path, settings: "BagSettings", *, overwrite: bo
         table.add_row(role, name, "guessed" if role in summary.guessed else "given")
     console.print(table)
     for note in summary.notes:
-        console.print(note, markup=False, highlight=False, soft_wrap=True)
+        console.print(note, highlight=False, soft_wrap=True)
     for why, count in list(summary.skipped.items())[:SHOWN_REASONS]:
-        console.print(f"left out {count} frames: {why}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"left out {count} frames: {why}", highlight=False, soft_wrap=True)
     if len(summary.skipped) > SHOWN_REASONS:
         console.print(f"left out {sum(summary.skipped.values())} frames in all, for {len(summary.skipped)} reasons")
     console.print(
@@ -165,7 +165,7 @@ def _import_folder(
 
     summary = import_folder(folder, recording, out, overwrite=overwrite, allow_outside=allow_outside)
     for note in summary.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"note: {note}", highlight=False, soft_wrap=True)
     for name, why in summary.skipped:
         console.print(f"left out {name}: {why}")
     console.print(

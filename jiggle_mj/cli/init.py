@@ -19,13 +19,11 @@ def init(folder: PathArgument, /, *, as_json: AsJson = False) -> None:
     from ..importing.init import describe_folder
 
     description = describe_folder(Path(folder))
-    console.print(description.text, markup=False, highlight=False, soft_wrap=True)
-    console.print(f"wrote {description.path}: check the lines above", markup=False, highlight=False, soft_wrap=True)
+    console.print(description.text, highlight=False, soft_wrap=True)
+    console.print(f"wrote {description.path}: check the lines above", highlight=False, soft_wrap=True)
     if description.problem is None:
-        console.print(f"then: jiggle-mj import {folder} --out run.mcap", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"then: jiggle-mj import {folder} --out run.mcap", highlight=False, soft_wrap=True)
     else:
-        console.print(
-            f"an import is still refused: {description.problem}", markup=False, highlight=False, soft_wrap=True
-        )
+        console.print(f"an import is still refused: {description.problem}", highlight=False, soft_wrap=True)
     if as_json:
         print(json.dumps({"recording_toml": str(description.path), "problem": description.problem}))

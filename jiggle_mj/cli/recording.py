@@ -129,7 +129,7 @@ def _record_series(
         f"{folder}: {n_made} recordings made, {series.n_kept} kept, {len(series.failed)} failed", soft_wrap=True
     )
     for failed_seed, why in series.failed.items():
-        console.print(f"seed {failed_seed} failed: {why}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"seed {failed_seed} failed: {why}", highlight=False, soft_wrap=True)
     if as_json:
         failed = [{"seed": failed_seed, "why": why} for failed_seed, why in series.failed.items()]
         print(json.dumps({"folder": str(folder), "recordings": [*map(str, series.recordings)], "failed": failed}))

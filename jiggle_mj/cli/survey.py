@@ -16,7 +16,7 @@ from .terminal import console
 
 def doubt(text: str) -> None:
     """Print a line about what is doubtful."""
-    console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    console.print(text, style="yellow", highlight=False, soft_wrap=True)
 
 
 def show_survey(path: Path) -> Survey:

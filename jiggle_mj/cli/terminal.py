@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..estimate import Estimate
     from ..observation import Observation
 
-console = Console(stderr=True)
+console = Console(stderr=True, markup=False)
 WORTH_SAYING = 0.5
 """Sum of P(attached) from which it is said where no particle is reported: likelier than not, one is attached."""
 FAILED, WRONG_USAGE = 1, 2
@@ -35,7 +35,7 @@ def log(text: str) -> None:
 
 def note(text: object) -> None:
     """Print a line in red."""
-    console.print(f"jiggle-mj: {text}", style="red", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"jiggle-mj: {text}", style="red", highlight=False, soft_wrap=True)
 
 
 def stop(failure: object, code: int) -> NoReturn:
@@ -102,7 +102,6 @@ def show(figures: dict, out: Path, as_json: bool) -> None:
     detection, calibration = figures["detection"], figures["calibration"]
     console.print(
         f"{detection['n_detected']} of {figures['n_particles']} particles reported attached ({detection['rule']})",
-        markup=False,
     )
     expected = detection.get("n_expected") or 0.0  # not in results of older versions
     if not detection["n_detected"] and expected >= WORTH_SAYING:
@@ -120,11 +119,11 @@ def show(figures: dict, out: Path, as_json: bool) -> None:
             parts.append(f"tracking RMS {1e3 * figures['tracking']['rms_m']:.2f} mm")
         console.print(", ".join(parts))
     for skipped in figures["frames"]["skipped"]:
-        console.print(f"frame {skipped['index']} skipped: {skipped['why']}", markup=False, highlight=False)
+        console.print(f"frame {skipped['index']} skipped: {skipped['why']}", highlight=False)
     for index in figures["frames"]["not_converged"]:
         console.print(f"frame {index}: the search for the sheet's state did not converge; trust this frame less.")
     for doubt in doubts(figures):
         console.print(doubt)
-    console.print(f"report: {out / 'report.html'}", markup=False)
+    console.print(f"report: {out / 'report.html'}")
     if as_json:
         print(json.dumps(figures))

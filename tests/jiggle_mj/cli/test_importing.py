@@ -41,6 +41,17 @@ def test_inspect_lists_topics_and_what_is_missing(tmp_path, monkeypatch, capsys)
     assert len(report["missing"]) == 2 and "--closed 'jaw<0.1'" in report["missing"][1]
 
 
+def test_a_topic_may_be_named_as_markup_is_written(tmp_path, monkeypatch, capsys):
+    with RobotBag(tmp_path / "bag") as bag:
+        bag.cameras(small_camera())
+        write_images(bag)
+        bag.pose("/[/b]t", 0, [0, 0, 0])
+        bag.write("/[red]c", 0, "std_msgs/Bool", data=True)
+    assert call(monkeypatch, "inspect", bag.path) == 0
+    shown = capsys.readouterr().err
+    assert "/[/b]t" in shown and "/[red]c" in shown
+
+
 def test_inspect_reads_recordings_of_ours(tmp_path, monkeypatch, capsys):
     call(monkeypatch, "import", small_bag(tmp_path / "bag"), "--out", tmp_path / "run.mcap")
     capsys.readouterr()
