@@ -77,7 +77,6 @@ class MarkCheck:
         self._refuse_where(positions, np.asarray(jumped | at_origin), "it is elsewhere in other frames")
         alone = always & isolated(positions[0], spacing(positions[0]))
         self._refuse_where(positions, marked & alone, "it is there in every frame, far from all others")
-        self._refuse_lost_coordinate(positions)
         identity = PointIdentity(positions[0], spacing(positions[0]))
         for frame in positions:
             identity.add(frame)
@@ -97,23 +96,6 @@ class MarkCheck:
             f"rows {np.flatnonzero(always)[:MAX_LISTED_ROWS].tolist()} from 0 are at exactly ({x:g}, {y:g}, {z:g}) in "
             f"every frame, and no other point stands still: if they are lost, give missing = [{x:g}, {y:g}, {z:g}]"
         ]
-
-    def _refuse_lost_coordinate(self, positions: Float[np.ndarray, "t n 3"]) -> None:
-        """Refuse a coordinate that is exactly 0 in some frames and, in others, beyond the size of the sheet from 0."""
-        zero, extent = positions == 0, _extent(positions)
-        seen = np.where(zero, np.nan, positions)
-        for axis, name in enumerate("xyz"):
-            frames, points = np.nonzero(zero[:, :, axis] & np.isfinite(seen[:, :, axis]).any(axis=0))
-            if not len(frames):
-                continue
-            away = np.nanmedian(np.abs(seen[:, points, axis]), axis=0)
-            lost = away > extent
-            if lost.any():
-                frame, row = int(frames[lost][0]), int(points[lost][0])
-                raise RecordingError(
-                    f"{self.names[frame]}, row {row} from 0, has {name} = 0, and {away[lost][0]:.3g} in other frames; "
-                    f"so have {lost.sum()} positions in all. If the tracker lost {name} there, write NaN for it."
-                )
 
     def _refuse_where(self, positions: Float[np.ndarray, "t n 3"], wrong: Bool[np.ndarray, "t n"], why: str) -> None:
         """Refuse the wrong positions of the first frame that has any."""

@@ -37,17 +37,6 @@ def test_one_lost_point_a_frame_at_a_place_inside_the_sheet_is_refused(tmp_path,
         notes(tmp_path, positions)
 
 
-def test_a_depth_of_zero_far_from_the_sheet_is_refused(tmp_path):
-    """x and y stay, as where a depth camera saw nothing; a row that is unseen in all other frames shows nothing."""
-    positions = sheet() + np.array([0, 0, 400.0])
-    positions[1:, 30] = np.nan
-    (tmp_path / "again").mkdir()
-    assert not notes(tmp_path, positions)
-    positions[3, [20, 25]] *= (1, 1, 0)
-    with pytest.raises(RecordingError, match=r"frame 3, row 20 .* has z = 0, and 40\d in other .* 2 positions in all"):
-        notes(tmp_path / "again", positions)
-
-
 @pytest.mark.parametrize("mark", [0, -1, -999])
 def test_a_row_that_is_at_a_mark_far_from_the_sheet_in_every_frame_is_refused(tmp_path, mark):
     positions = sheet() + 300
