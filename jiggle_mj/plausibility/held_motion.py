@@ -6,9 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..observation import Observation
+from .closed_tool import NS
 
-NS = 1e-9
-"""Seconds in a nanosecond [s]."""
 N_LEADERS = 4
 """Points whose mean displacement is that of the points that move most: fewer are a tracker's jumps."""
 
@@ -68,8 +67,8 @@ class HeldMotion:
 
     @property
     def grasps(self) -> Int[np.ndarray, " n"]:
-        """Return the grasp of each of them."""
-        return np.array([grasp for _, grasp, *_ in self._frames], int)
+        """Return the grasp of each of them, numbered from 0."""
+        return np.unique(np.array([grasp for _, grasp, *_ in self._frames], int), return_inverse=True)[1]
 
     @property
     def tool(self) -> Float[np.ndarray, "n 3"]:
@@ -88,11 +87,9 @@ class HeldMotion:
 
 
 def centred(places: Float[np.ndarray, "n 3"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Return places relative to the mean of their group [m]."""
-    result = places.copy()
-    for group in np.unique(groups):
-        result[groups == group] -= places[groups == group].mean(axis=0)
-    return result
+    """Return places relative to the mean of their group [m]; groups are numbered from 0 without a gap."""
+    sums = np.stack([np.bincount(groups, weights=places[:, axis]) for axis in range(3)], axis=1)
+    return places - (sums / np.bincount(groups)[:, np.newaxis])[groups]
 
 
 def rms(vectors: Float[np.ndarray, "n 3"]) -> float:

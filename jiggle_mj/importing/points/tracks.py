@@ -1,5 +1,6 @@
 """Rows of text tables become frames of tracks: by a column that numbers the frames, and one that names the points."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -44,17 +45,15 @@ def split_frames(rows: FrameRows, numbers: Float[np.ndarray, " n"], heading: str
             f"{rows.name} has one row for each value of '{quoted(heading)}': a table of all frames has a row for each "
             'point of each frame; save others as .npz. If it is one frame, give frame_column = "none" in [points].'
         )
-    frames = []
-    for number, value in enumerate(values):
-        which = np.flatnonzero(first == number)
-        frames.append(
-            FrameRows(
-                name=f"{rows.name} {quoted(heading)} {value:.15g}",
-                values=rows.values[which],
-                ids=None if rows.ids is None else [rows.ids[row] for row in which],
-            )
+    in_turn = np.split(np.argsort(first, kind="stable"), np.cumsum(np.bincount(first))[:-1])
+    return [
+        FrameRows(
+            name=f"{rows.name} {quoted(heading)} {value:.15g}",
+            values=rows.values[which],
+            ids=None if rows.ids is None else [rows.ids[row] for row in which],
         )
-    return frames
+        for value, which in zip(values, in_turn, strict=True)
+    ]
 
 
 def joined_tracks(frames: list[FrameRows], heading: str | None) -> tuple[Float[np.ndarray, "t n c"], list[str]]:
@@ -80,7 +79,7 @@ def joined_tracks(frames: list[FrameRows], heading: str | None) -> tuple[Float[n
     order = {name: row for row, name in enumerate(dict.fromkeys(chain.from_iterable(ids)))}
     for frame, names in zip(named, ids, strict=True):
         if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
+            twice = next(name for name, count in Counter(names).items() if count > 1)
             raise RecordingError(
                 f"{frame.name} has the {quoted(heading)} '{quoted(twice)}' in several rows: {_CURE.format('names')}"
             )
