@@ -197,10 +197,14 @@ class StereoCamera:
         """Return the distance between the two centres of projection [m]."""
         return float(-self.right.P[0, 3] / self.right.P[0, 0])
 
+    def in_camera(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Return world points in the left rectified optical frame [m]."""
+        T = np.linalg.inv(self.T_world_camera)
+        return points @ T[:3, :3].T + T[:3, 3]
+
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Return left pixel u, v and disparity u_left - u_right [px] of world points [m]; it is positive in front."""
-        T = np.linalg.inv(self.T_world_camera)
-        camera = points @ T[:3, :3].T + T[:3, 3]
+        camera = self.in_camera(points)
         (fx, fy), (cx, cy), depth = self.focal, self.centre, camera[..., 2]
         return np.stack(
             [fx * camera[..., 0] / depth + cx, fy * camera[..., 1] / depth + cy, fx * self.baseline / depth], axis=-1

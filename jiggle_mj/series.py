@@ -105,12 +105,12 @@ def record_series(
     as_instance(scene, "scene", Scene, hint="load_scene(NAME) reads one.")
     as_choice(sensing, "sensing", SENSING)
     folder = as_path(folder, "folder")
-    if as_integer(count, "count", at_least=1) > MAX_RECORDINGS:
+    count, seed = as_integer(count, "count", at_least=1), as_integer(seed, "seed", at_least=0)
+    if count > MAX_RECORDINGS:
         raise OptionError(
             f"count = {quoted(count)}: at most {MAX_RECORDINGS} recordings are made; give another --seed for "
             "further ones."
         )
-    count, seed = as_integer(count, "count", at_least=1), as_integer(seed, "seed", at_least=0)
     if executor is not None:
         as_instance(executor, "executor", Executor, hint="WorkerProcesses() is one.")
     orders = [

@@ -155,10 +155,8 @@ def _first_readable(folder: Path, files: PointFiles, failures: list[str]) -> Gue
             continue
         if found.time_heading is not None and way.times is None:
             try:
-                found, way = (
-                    read_frames(DataFolder(path=folder), timed := replace(way, times=found.time_heading)),
-                    timed,
-                )
+                timed = replace(way, times=found.time_heading)
+                found, way = read_frames(DataFolder(path=folder), timed), timed
             except RecordingError as failure:
                 failures.append(str(failure))
         if len(found.positions) >= 2 and len(_finite(found.positions[0])) >= 3:

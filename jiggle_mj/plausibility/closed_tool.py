@@ -25,7 +25,6 @@ class ClosedTool:
     held: float | None = None
     largest_gap_ns: int | None = None
     by_points: bool = False
-    distances: list[float] = field(default_factory=list)
     closings: list[ToolState] = field(default_factory=list)
     _last: Observation | None = None
 
@@ -59,10 +58,10 @@ class ClosedTool:
         self.motion = max(self.motion, float(np.linalg.norm(moved)))
         if np.isfinite(held).all():
             self.held = max(self.held or 0.0, float(np.linalg.norm(held)))
-            turned = (_rotation(tool) * _rotation(closing).inv()).apply(at_closing - closing.position)
-            carried = moved + turned - (at_closing - closing.position)
+            from_tip = at_closing - closing.position
+            rotated = moved + (_rotation(tool) * _rotation(closing).inv()).apply(from_tip) - from_tip
             # A tool whose offset from the held points is not rigid is judged by its displacement alone.
-            gap = min(float(np.linalg.norm(held - each)) for each in (moved, carried))
+            gap = min(float(np.linalg.norm(held - each)) for each in (moved, rotated))
             self.gap = max(self.gap or 0.0, gap)
         self.grasps.add(tool.grasp)
         self.frames += 1

@@ -11,8 +11,8 @@ MIN_FRAMES = 5
 """Frames of a grasp from which sums are compared: with fewer, a point that slips does the same."""
 FOLLOWS, STRAYS = 0.25, 0.5
 """Largest difference from the tool's displacement, over the tool's largest: below the first the sums follow it, above
-the second the displacements do not. Points beside the jaws lag by a fifth; those that slip stay where they were after
-any number of frames, not after the first."""
+the second the displacements do not. Points beside the jaws lag by a fifth. Limit: at a constant speed of the tool,
+points that slip after one frame, or follow by a share of about 2 over the number of frames, look the same."""
 
 
 class SummedMotion:

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from ..observation import MeasuredPoints, ToolState
+from .grip_share import held_points
 from .identity import PointIdentity
 from .noise import NeighbourNoise, noise_of_difference
 
@@ -91,13 +92,10 @@ class PointMotion:
         What it holds is the declared tracks, or else all points within the grip's radius; without one, the nearest.
         """
         self._closing = positions = self._by_track(points)
+        self._held = np.flatnonzero(held_points(tool, positions, self._ids))
         if tool.held_tracks:
-            self._held = np.flatnonzero(np.isin(self._ids, tool.held_tracks))
             unknown = set(tool.held_tracks) - set(self._ids.tolist())
             self.missing_tracks = tuple(sorted({*self.missing_tracks, *unknown}))
-        else:
-            from_tip = np.linalg.norm(positions - tool.position, axis=1)
-            self._held = np.flatnonzero(from_tip <= tool.radius)
         held = positions[self._held]
         held = held[np.isfinite(held).all(axis=1)]
         self.held_at_closing = held.mean(axis=0) if len(held) else np.full(3, np.nan)

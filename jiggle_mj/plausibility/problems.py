@@ -9,6 +9,8 @@ from dataclasses import replace
 
 from .problem import RecordingProblem, metres, seconds
 from .survey import Survey
+from .tool_fits import APART
+from .tool_problems import NOISE_MULTIPLES
 
 REFUSED_EXTENT_M, DOUBTED_EXTENT_M = (1e-3, 10.0), (5e-3, 2.0)
 """Extent of the sheet [m]: outside the first it is refused, outside the second doubted. A corneal flap is 8 mm wide, a
@@ -20,11 +22,6 @@ FARTHEST_EXTENTS = 3.0
 """Distance of the tool that no large sheet explains [extents of the sheet]."""
 STILL_SHARE = 0.1
 """Share of the held points' motion below which the tool counts as standing still, and the other way round."""
-DOUBTED_GAP_SHARE = 0.5
-"""Difference between the displacements of tool and held points that is doubted [largest of the two]. Above 1 they do
-not move together: a tool that turns or slips still pulls its own way."""
-NOISE_MULTIPLES = 3.0
-"""Motion that is noise, and ratio of declared to measured noise that is doubted: three standard deviations."""
 MIN_BASELINE_M, DOUBTED_BASELINE_M = 1e-4, (1e-3, 0.5)
 """Distance between the cameras [m]: a stereo endoscope has 4 to 6 mm, a wide bench rig 0.3 m. `StereoCamera` refuses
 one above 1 m."""
@@ -197,14 +194,14 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
             )
         elif survey.sensing == "points":
             yield _warn("held-still", "points move, and those that the tool holds do not; are the held rows right?")
+    still = held is not None and tool < STILL_SHARE * held
+    apart = held is not None and survey.tool_gap_m is not None and survey.tool_gap_m > max(held, tool) + noise
     if survey.why_apart is not None:
-        apart = held is not None and survey.tool_gap_m is not None and survey.tool_gap_m > max(held, tool) + noise
-        still = held is not None and tool < STILL_SHARE * held
         yield replace(survey.why_apart, refuses=apart or still)
         return
     if held is None or survey.tool_by_points or max(held, tool) <= noise:
         return
-    if tool < STILL_SHARE * held:
+    if still:
         yield _refuse(
             "tool-still",
             f"the tool moves {metres(tool)} while the points that it holds move {metres(held)}; do the clocks of tool "
@@ -216,14 +213,14 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
             f"the tool moves {metres(tool)} and the points that it holds {metres(held)}; did they slip, are the held "
             "rows right, or is the tool's unit or clock another one?",
         )
-    elif survey.tool_gap_m is not None and survey.tool_gap_m > max(held, tool) + noise:
+    elif apart and survey.tool_gap_m is not None:
         yield _refuse(
             "tool-apart",
             f"tool and held points move apart by {metres(survey.tool_gap_m)}, further than either moves "
             f"({metres(tool)} and {metres(held)}): one moves while the other stands, or the other way. Is the tool's "
             "clock late, or its frame another one?",
         )
-    elif survey.tool_gap_m is not None and survey.tool_gap_m > max(DOUBTED_GAP_SHARE * max(held, tool), noise):
+    elif survey.tool_gap_m is not None and survey.tool_gap_m > max(APART * max(held, tool), noise):
         yield _warn(
             "tool-gap",
             f"tool and held points move apart by {metres(survey.tool_gap_m)} while they move {metres(held)}; does the "

@@ -110,7 +110,7 @@ def survey(recording: Recording) -> Survey:
         recording: an open recording; iterating it anew afterwards begins at its first frame.
     """
     motion, closed, times, track = PointMotion(), ClosedTool(), list[int](), HeldMotion()
-    summed, shares, mesh = SummedMotion(), list[float](), recording.declaration.mesh
+    summed, shares, distances, mesh = SummedMotion(), list[float](), list[float](), recording.declaration.mesh
     tools: list[tuple[int, ToolState]] = []
     stride = max(1, len(recording) // COMPARED_FRAMES)
     first_cloud: Float[np.ndarray, "m 3"] | None = None
@@ -125,7 +125,7 @@ def survey(recording: Recording) -> Survey:
             identified |= points.track_id is not None
             if closed.begins(observation):
                 shares.append(grip_share(observation.tool, points, mesh))
-                closed.distances.append(
+                distances.append(
                     nearest_distance(points.positions, observation.tool.position)
                     if points.track_id is None
                     else motion.close(points, observation.tool)
@@ -146,19 +146,19 @@ def survey(recording: Recording) -> Survey:
     steps = np.diff(times)
     seen = "points" if identified else "cloud" if first_cloud is not None else "nothing"
     depth, disparity, in_view = _in_camera(recording.camera, [tool.position for tool in closed.closings])
-    distances = [distance for distance in closed.distances if np.isfinite(distance)]
+    distances = [distance for distance in distances if np.isfinite(distance)]
     left = None if recording.camera is None else recording.camera.left
-    sd = noise_sd or 0.0
+    sd, apart = noise_sd or 0.0, None if rest is None else spacing(rest)
     why = None if closed.by_points else why_apart(track, noise_sd=sd)
     doubts = list[RecordingProblem]()
     if rest is not None:
-        apart, gravity = spacing(rest) or 0.0, np.array(recording.declaration.gravity)
+        gravity = np.array(recording.declaration.gravity)
         if not closed.by_points and why is None:
             doubts += outliers(track, noise_sd=sd)
-            doubts += tip_offset(track, spread=motion.held_spread, spacing=apart)
+            doubts += tip_offset(track, spread=motion.held_spread, spacing=apart or 0.0)
         if recording.declaration.mesh is None:
             radius = max((tool.radius for tool in closed.closings if not tool.held_tracks), default=np.inf)
-            doubts += empty_grips(distances, reach=radius + apart)
+            doubts += empty_grips(distances, reach=radius + (apart or 0.0))
         if recording.declaration.bed and gravity.any():
             doubts += vertical(track, rest, gravity, noise_sd=sd)
     return Survey(
@@ -171,7 +171,7 @@ def survey(recording: Recording) -> Survey:
         largest_gap_s=None if closed.largest_gap_ns is None else closed.largest_gap_ns * NS,
         points=None if rest is None else len(rest),
         extent_m=None if rest is None else extent(rest),
-        spacing_m=None if rest is None else spacing(rest),
+        spacing_m=apart,
         unseen=1 - motion.n_seen / motion.n_expected if motion.n_expected else None,
         points_motion_m=motion.largest if motion.n_expected else None,
         held_motion_m=closed.held,
@@ -207,8 +207,7 @@ def _in_camera(
     if camera is None or not places:
         return None, None, None
     world = np.array(places)
-    T = np.linalg.inv(camera.T_world_camera)
-    depths = (world @ T[:3, :3].T + T[:3, 3])[:, 2]
+    depths = camera.in_camera(world)[:, 2]
     depth = common(depths.tolist())
     if depth is None or (depths <= 0).any():
         return depth, None, False

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from .held_motion import HeldMotion, centred, rms
 
 APART = 0.5
-"""Difference of tool and held points, over the motion of the held points, that deserves an explanation: as for
-`tool-gap`. A rotation by 29 degrees gives it."""
+"""Difference of tool and held points, over their motion, that is doubted and deserves an explanation. A rotation by 29
+degrees gives it. Above 1 they do not move together: a tool that turns or slips still pulls its own way."""
 EXPLAINED = 0.25
 """Share of the difference, and of the motion, that an explanation may leave."""
 UNIT_FACTORS = (1e3, 1e2, 10.0, 25.4, 1 / 25.4, 0.1, 1e-2, 1e-3)
@@ -83,11 +83,11 @@ def frame_fit(track: HeldMotion, *, noise: float) -> FrameFit | None:
     if not centrings:
         return None
 
-    def left(axes: Float[np.ndarray, "3 3"], factor: float) -> list[float]:
+    def residual(axes: Float[np.ndarray, "3 3"], factor: float) -> list[float]:
         return [rms(q - factor * p @ axes.T) for p, q in centrings]
 
-    signals, before = [rms(q) for _, q in centrings], left(np.eye(3), 1.0)
-    candidates = [(axes, factor, left(axes, factor)) for axes, factor in _candidates(centrings)]
+    signals, before = [rms(q) for _, q in centrings], residual(np.eye(3), 1.0)
+    candidates = [(axes, factor, residual(axes, factor)) for axes, factor in _candidates(centrings)]
     costs = [sum((after / signal) ** 2 for after, signal in zip(each[2], signals, strict=True)) for each in candidates]
     # The first is the simplest one; of pure lifts, say, all rotations about the vertical are equally good.
     chosen = next(each for each, cost in zip(candidates, costs, strict=True) if cost <= 2 * min(costs) + EXPLAINED**3)
@@ -132,21 +132,21 @@ def clock_fit(track: HeldMotion, *, noise: float) -> ClockFit | None:
         return None
     path_times, path = track.path()
 
-    def left(late: float, drift: float) -> float:
+    def residual(late: float, drift: float) -> float:
         at = times + late + drift * (times - times[0])
         tool = np.stack([np.interp(at, path_times, path[:, k]) for k in range(3)], axis=1)
         return rms(held - centred(tool, grasps))
 
-    before = left(0.0, 0.0)
+    before = residual(0.0, 0.0)
     if before <= noise:
         return None
     span = max(SEARCHED_S, SEARCHED_PERIODS * float(np.median(np.diff(times))))
-    late, drift = _search(left, span, 0.0)
-    after = left(late, drift)
-    drifted = _search(left, span, SEARCHED_DRIFT) if after > noise else (late, drift)
-    if left(*drifted) <= CLOCK_EXPLAINED * after and abs(drifted[1]) >= LEAST_DRIFT:
+    late, drift = _search(residual, span, 0.0)
+    after = residual(late, drift)
+    drifted = _search(residual, span, SEARCHED_DRIFT) if after > noise else (late, drift)
+    if residual(*drifted) <= CLOCK_EXPLAINED * after and abs(drifted[1]) >= LEAST_DRIFT:
         late, drift = drifted
-        after = left(late, drift)
+        after = residual(late, drift)
     elif abs(late) < LEAST_SHIFT_S:
         return None
     linear = np.linalg.lstsq(centred(track.tool, grasps), held, rcond=1e-6)[0]
@@ -156,13 +156,13 @@ def clock_fit(track: HeldMotion, *, noise: float) -> ClockFit | None:
     return ClockFit(late=late, drift=drift, before=before, after=after)
 
 
-def _search(left: Callable[[float, float], float], span: float, drift_span: float) -> tuple[float, float]:
+def _search(residual: Callable[[float, float], float], span: float, drift_span: float) -> tuple[float, float]:
     """Return shift [s] and drift with the least difference, on grids that become finer."""
     late, drift = 0.0, 0.0
     n_shifts, n_drifts = (N_DRIFTS, N_DRIFTS) if drift_span else (N_SHIFTS, 0)
     for _ in range(4):
         shifts = late + span * np.arange(-n_shifts, n_shifts + 1) / n_shifts
         drifts = drift + drift_span * np.arange(-n_drifts, n_drifts + 1) / max(n_drifts, 1)
-        late, drift = min(itertools.product(shifts.tolist(), drifts.tolist()), key=lambda each: left(*each))
+        late, drift = min(itertools.product(shifts.tolist(), drifts.tolist()), key=lambda each: residual(*each))
         span, drift_span = 2 * span / n_shifts, 2 * drift_span / max(n_drifts, 1)
     return late, drift

@@ -14,7 +14,8 @@ from .problem import RecordingProblem, metres
 from .tool_fits import APART, LEAST_FRAMES, ClockFit, FrameFit, clock_fit, frame_fit
 
 NOISE_MULTIPLES = 3.0
-"""Motion that is noise [standard deviations of a coordinate]."""
+"""Motion that is noise [standard deviations of a coordinate], and ratio of declared to measured noise that is
+doubted."""
 NEVER_FOLLOWS = 0.02
 """Held over reported motion below which a unit is wrong, as no slip or row would be so even."""
 FOLLOWS, STANDS = 0.5, 0.2
@@ -61,11 +62,12 @@ def why_apart(track: HeldMotion, *, noise_sd: float) -> RecordingProblem | None:
 def _frame_problem(fit: FrameFit, *, several: bool) -> RecordingProblem:
     same_axes, same_unit = np.allclose(fit.axes, np.eye(3)), fit.factor == 1.0
     found = f"tool and held points differ by {metres(fit.before)}, and by {metres(fit.after)} if the tool's motion is"
-    unit = "" if same_unit else f"{times(fit.factor)} as large"
+    unit = "" if same_unit else f"{factor_named(fit.factor)} as large"
     if same_axes:
         return RecordingProblem(
             name="tool-unit",
-            # Points beside the grip go a tenth of its way too; never a hundredth, nor from grasp to grasp.
+            # Points beside the grip move by a tenth of its displacement too, never by a hundredth. Limit: by a 25th in
+            # several grasps they look like inches.
             refuses=several or fit.factor > 1 or fit.factor < NEVER_FOLLOWS,
             text=f"{found} {unit}; give its positions in the unit of the points, or tool_unit (inches must be "
             "converted).",
@@ -97,7 +99,7 @@ def _clock_problem(fit: ClockFit) -> RecordingProblem:
     )
 
 
-def times(factor: float) -> str:
+def factor_named(factor: float) -> str:
     """Return a factor in words."""
     return f"{factor:.4g} times" if factor >= 1 else f"1/{1 / factor:.4g}"
 

@@ -58,7 +58,7 @@ def tool_in_view(camera: StereoCamera, prepared: Preparation, scene: tuple[float
     readings = "; or ".join(_other_readings(camera, prepared, scene))
     if near and not readings:
         return []
-    seen = _in_camera(camera, tips)
+    seen = camera.in_camera(tips)
     behind = not (seen[:, 2] > 0).any()
     where = "always behind the left camera" if behind else "mostly out of view" if near else "always far out of view"
     text = f"with closed jaws the tip is {where}: x, y, z = {np.median(seen, axis=0).round(4).tolist()} m (median) in "
@@ -116,17 +116,11 @@ def _in_scene(
     else:
         nearest, farthest = _depths(camera, scene)
         nearest, farthest = nearest / SCENE_FACTOR, farthest * SCENE_FACTOR
-    depth = _in_camera(camera, tips)[:, 2]
+    depth = camera.in_camera(tips)[:, 2]
     inside = (depth >= nearest) & (depth <= farthest)
     pixels = camera.project(tips[inside])[:, :2]
     inside[inside] = ((pixels > -margin * size) & (pixels < (1 + margin) * size)).all(axis=1)
     return inside
-
-
-def _in_camera(camera: StereoCamera, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return places of the world in the left camera's rectified frame [m]."""
-    T = np.linalg.inv(camera.T_world_camera)
-    return places @ T[:3, :3].T + T[:3, 3]
 
 
 def _depths(camera: StereoCamera, scene: tuple[float, float]) -> tuple[float, float]:

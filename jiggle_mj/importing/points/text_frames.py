@@ -51,13 +51,13 @@ def read_text_frames(paths: list[Path], points: PointFiles) -> Measured:
     finite = np.asarray(np.isfinite(values[:, :, :n]).all(axis=2))
     for number, column in enumerate(ratings, start=len(wanted)):
         name = first.sample.names[column]
-        rule = f"{name} {'>=' if HIDDEN_NAME.search(name) else '<'} 0.5"
+        suggested = f"{name} {'>=' if HIDDEN_NAME.search(name) else '<'} 0.5"
         refuse_low_ratings(
             values[:, :, number],
             finite,
             key=name,
             where=f"{first.text.path} has a column '{quoted(name)}'",
-            cure=f'missing = "{quoted(rule)}" in [points], or missing = "{NONE}"',
+            cure=f'missing = "{quoted(suggested)}" in [points], or missing = "{NONE}"',
             none="missing",
         )
     return Measured(
