@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import RecordingError
-from ..plausibility.held_motion import N_LEADERS
+from ..plausibility.held_motion import leading_motion
 from ..plausibility.increments import follow_in_sum
 from .clock import FrameClock
 from .grasps import GraspSpan
@@ -117,7 +117,7 @@ def _refuse_still(
     closed = range(grasp.closing, grasp.frames[1])
     moved = frames[grasp.closing : grasp.frames[1]] - frames[grasp.closing]
     least = max(MIN_MOTION, MOTION_NOISE * given.noise_sd)
-    leaders = {"the points that move most": _leading(moved)}
+    leaders = {"the points that move most": leading_motion(moved)}
     if reports is not None:
         tips = np.stack([reports.at(clock.times[k])[0] for k in closed])
         leaders["the tool"] = tips - tips[0]
@@ -154,10 +154,3 @@ def _shares(moved: Float[np.ndarray, "t h 3"], leading: Float[np.ndarray, "t 3"]
     far = np.linalg.norm(leading, axis=1)
     at = int(np.argmax(far))
     return moved[at] @ leading[at] / far[at] ** 2
-
-
-def _leading(moved: Float[np.ndarray, "t n 3"]) -> Float[np.ndarray, "t 3"]:
-    """Return the mean displacement of the points that move most in each frame [m]."""
-    length = np.nan_to_num(np.linalg.norm(moved, axis=2))
-    most = np.argsort(length, axis=1)[:, -N_LEADERS:]
-    return np.nan_to_num(np.take_along_axis(moved, most[:, :, np.newaxis], axis=1)).mean(axis=1)

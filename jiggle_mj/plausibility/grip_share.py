@@ -21,17 +21,18 @@ def held_points(
     return np.asarray(np.linalg.norm(positions - tool.position, axis=1) <= tool.radius)
 
 
-def grip_share(tool: ToolState, points: MeasuredPoints, mesh: DeclaredMesh | None) -> float:
+def grip_share(tool: ToolState, points: MeasuredPoints, mesh: DeclaredMesh | None, *, known: int) -> float:
     """Return the share of the sheet's points that are held, or of the declared mesh's vertices; 0 without any.
 
     Args:
         tool: in the frame in which the jaws close.
         points: in that frame.
         mesh: as it is declared; None without one.
+        known: number of points that were seen before; a tool may hide most of what it does not hold.
     """
-    seen = np.isfinite(points.positions).all(axis=1)
-    ids = None if points.track_id is None else points.track_id[seen]
-    places, ids = (points.positions[seen], ids) if mesh is None else (mesh.vertices, mesh.track_id)
-    by_mesh = None if tool.held_tracks or mesh is None else mesh.held
-    held = held_points(tool, places, ids) if by_mesh is None else by_mesh
-    return float(held.mean()) if len(held) else 0.0
+    if mesh is not None and mesh.held is not None and not tool.held_tracks:
+        return float(mesh.held.mean())
+    if mesh is not None:
+        return float(held_points(tool, mesh.vertices, mesh.track_id).mean())
+    held = held_points(tool, points.positions, points.track_id) & np.isfinite(points.positions).all(axis=1)
+    return float(held.sum() / max(known, len(held), 1))

@@ -43,7 +43,7 @@ class HeldMotion:
         if self._last is not None and self._last[0].tool.closed == tool.closed:
             before, was = self._last
             n = min(len(was), len(positions))
-            step, leading = tool.position - before.tool.position, _leading(positions[:n] - was[:n])
+            step, leading = tool.position - before.tool.position, leading_motion(positions[:n] - was[:n])
             if before.tool.grasp == tool.grasp:
                 self._shares[tool.closed] += np.array([leading @ step, step @ step])
         self._last = observation, positions
@@ -97,9 +97,9 @@ def rms(vectors: Float[np.ndarray, "n 3"]) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
-def _leading(steps: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 3"]:
-    """Return the mean step of the points that move most [m]."""
-    seen = steps[np.isfinite(steps).all(axis=1)]
-    if not len(seen):
-        return np.zeros(3)
-    return seen[np.argsort(np.linalg.norm(seen, axis=1))[-N_LEADERS:]].mean(axis=0)
+def leading_motion(moved: Float[np.ndarray, "*t n 3"]) -> Float[np.ndarray, "*t 3"]:
+    """Return the mean displacement of the points that move most [m], NaN where unseen; 0 where none is seen."""
+    most = np.argsort(np.nan_to_num(np.linalg.norm(moved, axis=-1), nan=-1.0), axis=-1)[..., -N_LEADERS:]
+    taken = np.take_along_axis(moved, most[..., np.newaxis], axis=-2)
+    seen = np.isfinite(taken)
+    return np.sum(taken, axis=-2, where=seen) / np.maximum(1, seen.sum(axis=-2))

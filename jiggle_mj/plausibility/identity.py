@@ -69,7 +69,7 @@ class PointIdentity:
         last[: len(self._last)] = self._last
         step = positions - last
         rows = np.flatnonzero(np.isfinite(step).all(axis=1))
-        self._last = np.where(np.isfinite(positions), positions, last)
+        self._last = positions  # not those from before a point was hidden: meanwhile its neighbours moved on
         limit = JUMP * self._spacing
         if len(rows) <= N_NEIGHBOURS or not limit:
             return

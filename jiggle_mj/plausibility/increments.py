@@ -1,47 +1,43 @@
 """Displacements from frame to frame that were taken for displacements from rest: only their sum follows the tool."""
 
-from collections import defaultdict
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
 
-from ..observation import ToolState
+from .held_motion import HeldMotion, rms
+from .problem import RecordingProblem
 
 MIN_FRAMES = 5
 """Frames of a grasp from which sums are compared: with fewer, a point that slips does the same."""
 FOLLOWS, STRAYS = 0.25, 0.5
 """Largest difference from the tool's displacement, over the tool's largest: below the first the sums follow it, above
-the second the displacements do not. Points beside the jaws lag by a fifth. Limit: at a constant speed of the tool,
-points that slip after one frame, or follow by a share of about 2 over the number of frames, look the same."""
+the second the displacements do not. Points beside the jaws lag by a fifth."""
+EXPLAINED = 0.5
+"""Share of what a slip leaves that the tool's steps may leave: as with a clock, by chance below 1e-6 for 8 frames."""
 
 
-class SummedMotion:
-    """Displacements of tool and held points in each grasp."""
+def increments(track: HeldMotion) -> Iterator[RecordingProblem]:
+    """Find displacements from frame to frame; they are doubted only where points that slip explain them as well.
 
-    def __init__(self) -> None:
-        """Begin without a frame."""
-        self._grasps: defaultdict[int, list[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]]] = defaultdict(
-            list
+    Args:
+        track: tool and held points; the tool's position is an independent measurement.
+    """
+    grasps = [
+        (held - held[0], tool - tool[0])
+        for grasp in np.unique(track.grasps)
+        for held, tool in [(track.held[track.grasps == grasp], track.tool[track.grasps == grasp])]
+    ]
+    summed = [(held, tool) for held, tool in grasps if follow_in_sum(held, tool)]
+    if summed:
+        sure = any(no_slip(held, tool) for held, tool in summed)
+        yield RecordingProblem(
+            name="increments",
+            refuses=sure,
+            text="the held points do not follow the tool, and the sum of their displacements over the frames does: "
+            f"{'' if sure else 'unless they slip, '}displacements must be those from the rest frame, not from the "
+            "frame before; sum them up, or export them relative to the reference.",
         )
-
-    def add(self, tool: ToolState, held: Float[np.ndarray, " 3"]) -> None:
-        """Take one frame.
-
-        Args:
-            tool: the tool.
-            held: mean displacement of the held points since the jaws closed [m], NaN if unknown.
-        """
-        if tool.closed and not tool.by_points:
-            self._grasps[tool.grasp].append((held, tool.position))
-
-    @property
-    def follows(self) -> bool:
-        """Return whether in a grasp the sums of the held points' displacements follow the tool."""
-        known = [
-            (np.array([held for held, _ in grasp]), np.array([tip for _, tip in grasp]))
-            for grasp in self._grasps.values()
-        ]
-        return any(follow_in_sum(held, tips - tips[0]) for held, tips in known)
 
 
 def follow_in_sum(held: Float[np.ndarray, "t 3"], tool: Float[np.ndarray, "t 3"]) -> bool:
@@ -56,3 +52,23 @@ def follow_in_sum(held: Float[np.ndarray, "t 3"], tool: Float[np.ndarray, "t 3"]
         return False
     alone, summed = (float(np.linalg.norm(each - tool, axis=1).max()) for each in (held, np.cumsum(held, axis=0)))
     return alone > STRAYS * farthest and summed < FOLLOWS * farthest
+
+
+def no_slip(held: Float[np.ndarray, "t 3"], tool: Float[np.ndarray, "t 3"]) -> bool:
+    """Return whether the tool's steps explain displacements that follow in sum, and points that slip do not.
+
+    Those that slip follow by a share, stay where friction leaves them, or are dragged along by it: the share of the
+    tool's displacement, the place, and the drag against the direction of its steps are fitted. At a constant speed of
+    the tool they explain steps too.
+
+    Args:
+        held: as `follow_in_sum` takes it [m].
+        tool: displacement of the tool [m].
+    """
+    steps = np.diff(tool, axis=0, prepend=tool[:1])
+    size = np.linalg.norm(steps, axis=1, keepdims=True)
+    direction = np.divide(steps, size, out=np.zeros_like(steps), where=size > 0)
+    columns = [tool, direction, *(np.tile(axis, (len(tool), 1)) for axis in np.eye(3))]
+    design = np.stack([column.ravel() for column in columns], axis=1)
+    slipped = held.ravel() - design @ np.linalg.lstsq(design, held.ravel(), rcond=None)[0]
+    return rms(held - steps) < EXPLAINED * rms(slipped.reshape(-1, 3))

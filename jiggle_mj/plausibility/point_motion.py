@@ -55,6 +55,15 @@ class PointMotion:
         """Return the noise from how points stray from their neighbours [m]; None with too few points."""
         return None if self._neighbours is None else self._neighbours.sd
 
+    @property
+    def n_points(self) -> int:
+        """Return how many points there were so far."""
+        return len(self._ids)
+
+    def release(self) -> None:
+        """Forget what the last grasp held: the next one may begin in a frame without points."""
+        self._closing, self.held_at_closing = None, np.full(3, np.nan)
+
     def add(self, points: MeasuredPoints, tool: ToolState, *, still: bool, compare: bool) -> Float[np.ndarray, " 3"]:
         """Take one frame; return the mean displacement of the held points since the jaws closed [m], NaN if unknown.
 

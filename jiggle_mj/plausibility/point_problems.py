@@ -1,4 +1,4 @@
-"""What is wrong with measured points that are no sheet's: lost ones, mixed up rows, displacements from frame to frame.
+"""What is wrong with measured points that are no sheet's: lost ones, and mixed up rows.
 
 docs/RECORDINGS.md has the names as a table.
 """
@@ -6,31 +6,20 @@ docs/RECORDINGS.md has the names as a table.
 from collections.abc import Iterator
 
 from .identity import ISOLATED, Place, PointIdentity
-from .increments import SummedMotion
 from .problem import RecordingProblem
 
 MOST = 0.5
 """Share of a frame's points that change places from which rows are in another order; fewer are a tracker's mistakes."""
 
 
-def point_problems(identity: PointIdentity | None, summed: SummedMotion) -> Iterator[RecordingProblem]:
-    """Find points that lose their identity, and displacements that are not those from rest.
+def point_problems(identity: PointIdentity) -> Iterator[RecordingProblem]:
+    """Find points that lose their identity.
 
     Args:
-        identity: of the points with identities; None without any.
-        summed: motion of tool and held points.
+        identity: of the points, frame by frame.
     """
-    if identity is not None:
-        yield from _lost(identity)
-        yield from _exchanged(identity)
-    if summed.follows:
-        yield RecordingProblem(
-            name="increments",
-            refuses=True,
-            text="the held points do not follow the tool, and the sum of their displacements over the frames does: "
-            "displacements must be those from the rest frame, not from the frame before; sum them up, or export them "
-            "relative to the reference.",
-        )
+    yield from _lost(identity)
+    yield from _exchanged(identity)
 
 
 def _lost(identity: PointIdentity) -> Iterator[RecordingProblem]:

@@ -79,7 +79,7 @@ def _use(survey: Survey) -> Iterator[RecordingProblem]:
     if survey.grip_share is not None and survey.grip_share > MAX_HELD:
         yield _problem(
             "grip-share",
-            f"the tool holds {survey.grip_share:.0%} of the sheet's points; is the radius of the grip in metres, and "
+            f"the tool always holds {survey.grip_share:.0%} of the sheet's points, or more; is the radius of the grip in metres, and "
             "are the held rows right?",
             refuses=survey.grip_share == 1,
         )

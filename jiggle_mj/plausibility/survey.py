@@ -16,7 +16,7 @@ from .closed_tool import NS, ClosedTool
 from .grip_share import grip_share
 from .held_motion import HeldMotion
 from .image_problems import image_problems
-from .increments import SummedMotion
+from .increments import increments
 from .point_motion import PointMotion, common, extent, nearest_distance, spacing
 from .point_problems import point_problems
 from .problem import RecordingProblem
@@ -57,7 +57,7 @@ class Survey:
     held_motion_m: float | None
     """Largest mean displacement of the held points since the jaws closed [m]."""
     grip_share: float | None
-    """Largest share of the sheet's points, or of the declared mesh's vertices, that the tool holds."""
+    """Smallest share of the sheet's points, or of the declared mesh's vertices, that the tool holds in a grasp."""
     missing_tracks: tuple[int, ...]
     """Held tracks that no point has."""
     grasps: int
@@ -110,7 +110,7 @@ def survey(recording: Recording) -> Survey:
         recording: an open recording; iterating it anew afterwards begins at its first frame.
     """
     motion, closed, times, track = PointMotion(), ClosedTool(), list[int](), HeldMotion()
-    summed, shares, distances, mesh = SummedMotion(), list[float](), list[float](), recording.declaration.mesh
+    shares, distances, mesh = list[float](), list[float](), recording.declaration.mesh
     tools: list[tuple[int, ToolState]] = []
     stride = max(1, len(recording) // COMPARED_FRAMES)
     first_cloud: Float[np.ndarray, "m 3"] | None = None
@@ -120,11 +120,14 @@ def survey(recording: Recording) -> Survey:
         times.append(observation.time)
         tools.append((observation.index, observation.tool))
         points, held = observation.points, np.full(3, np.nan)
+        begins, n_first = closed.begins(observation), 0 if first_cloud is None else len(first_cloud)
+        if begins:
+            motion.release()
         if points is not None and len(points.positions):
             declared_sd = points.sd if declared_sd is None else declared_sd
             identified |= points.track_id is not None
-            if closed.begins(observation):
-                shares.append(grip_share(observation.tool, points, mesh))
+            if begins:
+                shares.append(grip_share(observation.tool, points, mesh, known=motion.n_points or n_first))
                 distances.append(
                     nearest_distance(points.positions, observation.tool.position)
                     if points.track_id is None
@@ -135,7 +138,6 @@ def survey(recording: Recording) -> Survey:
                 held = motion.add(points, observation.tool, still=still, compare=compare)
             first_cloud = points.positions if first_cloud is None else first_cloud
         closed.add(observation, held, motion.held_at_closing)
-        summed.add(observation.tool, held)
         track.add(observation, motion.held_at_closing + held, None if points is None else motion.positions)
     skipped = list(recording.skipped)
     rest = motion.rest if motion.rest is not None else first_cloud
@@ -151,8 +153,12 @@ def survey(recording: Recording) -> Survey:
     sd, apart = noise_sd or 0.0, None if rest is None else spacing(rest)
     why = None if closed.by_points else why_apart(track, noise_sd=sd)
     doubts = list[RecordingProblem]()
+    if motion.identity is not None:
+        doubts += point_problems(motion.identity)
     if rest is not None:
         gravity = np.array(recording.declaration.gravity)
+        if not closed.by_points:
+            doubts += increments(track)
         if not closed.by_points and why is None:
             doubts += outliers(track, noise_sd=sd)
             doubts += tip_offset(track, spread=motion.held_spread, spacing=apart or 0.0)
@@ -175,7 +181,7 @@ def survey(recording: Recording) -> Survey:
         unseen=1 - motion.n_seen / motion.n_expected if motion.n_expected else None,
         points_motion_m=motion.largest if motion.n_expected else None,
         held_motion_m=closed.held,
-        grip_share=max(shares, default=None),
+        grip_share=min(shares, default=None),
         missing_tracks=motion.missing_tracks,
         grasps=len(closed.grasps),
         closed_frames=closed.frames,
@@ -194,7 +200,7 @@ def survey(recording: Recording) -> Survey:
         tool_depth_m=depth,
         tool_disparity_px=disparity,
         tool_in_view=in_view,
-        doubts=(*doubts, *point_problems(motion.identity, summed), *image_problems(recording, tools)),
+        doubts=(*doubts, *image_problems(recording, tools)),
         declared=recording.declared,
         mesh_declared=mesh is not None,
     )

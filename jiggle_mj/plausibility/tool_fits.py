@@ -20,7 +20,7 @@ APART = 0.5
 degrees gives it. Above 1 they do not move together: a tool that turns or slips still pulls its own way."""
 EXPLAINED = 0.25
 """Share of the difference, and of the motion, that an explanation may leave."""
-UNIT_FACTORS = (1e3, 1e2, 10.0, 25.4, 1 / 25.4, 0.1, 1e-2, 1e-3)
+UNIT_FACTORS = (1e3, 1e2, 10.0, 25.4, 0.1, 1e-2, 1e-3, 1 / 25.4)
 """Held over reported motion where the tool has another unit: between um, mm, cm, dm, m, and inch."""
 LEAST_FRAMES = 8
 """Frames with held points below which no clock is fitted: a fit of two numbers to fewer says little."""
@@ -91,6 +91,8 @@ def frame_fit(track: HeldMotion, *, noise: float) -> FrameFit | None:
     costs = [sum((after / signal) ** 2 for after, signal in zip(each[2], signals, strict=True)) for each in candidates]
     # The first is the simplest one; of pure lifts, say, all rotations about the vertical are equally good.
     chosen = next(each for each, cost in zip(candidates, costs, strict=True) if cost <= 2 * min(costs) + EXPLAINED**3)
+    if any(after > max(was, EXPLAINED * signal) for was, after, signal in zip(before, chosen[2], signals, strict=True)):
+        return None  # what makes motion within a grasp alike may not carry the tool away from what it holds
     for was, after, signal in zip(before, chosen[2], signals, strict=True):
         if was >= APART * signal and after <= EXPLAINED * min(was, signal):
             return FrameFit(axes=chosen[0], factor=chosen[1], before=was, after=after)

@@ -55,6 +55,7 @@ def lifts(
     drift: float = 0.0,
     slip: float = 1.0,
     inverted: bool = False,
+    sd: float = SD,
     points: Callable[[np.ndarray], np.ndarray] = lambda places: places,
 ) -> list[Observation]:
     """Three corners are lifted one after the other; each argument makes one mistake.
@@ -65,6 +66,7 @@ def lifts(
         drift: age that a report gains in a second [s].
         slip: share of the tool's displacement that held points follow.
         inverted: whether the gripper reports open for closed.
+        sd: noise of a coordinate [m].
         points: the measured positions for the true ones.
     """
     rng, frames = np.random.default_rng(5), list[Observation]()
@@ -90,9 +92,9 @@ def lifts(
                     held_tracks=held if closed != inverted else (),
                 ),
                 points=MeasuredPoints(
-                    positions=points(REST + share[:, None] * moved) + rng.normal(scale=SD, size=REST.shape),
+                    positions=points(REST + share[:, None] * moved) + rng.normal(scale=sd, size=REST.shape),
                     track_id=np.arange(len(REST)),
-                    sd=SD,
+                    sd=sd,
                 ),
             )
         )
@@ -127,6 +129,37 @@ def test_what_the_estimator_allows_for_is_no_problem(tmp_path, mistake):
 
 def test_points_that_slip_are_explained_by_no_frame_and_no_clock(tmp_path):
     assert set(found(tmp_path, lifts(slip=0.3))) == {"tool-gap"}
+
+
+@pytest.mark.parametrize("slip", [0.04, 0.1, 0.001])
+def test_points_that_hardly_follow_over_several_grasps_are_no_unit(tmp_path, slip):
+    """Within each grasp the tool's motion seems to be in inches or cm, and it goes with the jaws from one to the next."""
+    assert "tool-unit" not in found(tmp_path, lifts(slip=slip, sd=2e-5))
+
+
+def test_displacements_from_frame_to_frame_are_refused(tmp_path):
+    """The tool speeds up, slows down and turns back, and so do they; no point that slips does."""
+    frames = lifts()
+    places = np.stack([frame.points.positions for frame in frames if frame.points is not None])
+    steps = np.diff(places, axis=0, prepend=places[:1])
+    wrong = [
+        replace(frame, points=replace(frame.points, positions=REST + step))
+        for frame, step in zip(frames, steps, strict=True)
+    ]
+    assert found(tmp_path, wrong)["increments"].refuses
+
+
+def test_points_that_friction_drags_along_are_not_refused(tmp_path):
+    """They follow by a step's length, and return when the tool turns back: their sum follows it too."""
+    up = np.array([0, 0, 1.0])
+    frames = lifts()
+    heights = np.array([frame.tool.position @ up for frame in frames])
+    drag = 6e-4 * np.sign(np.round(np.diff(heights, prepend=0.0), 6))
+    dragged = [
+        replace(frame, points=replace(frame.points, positions=REST + by * up))
+        for frame, by in zip(frames, drag, strict=True)
+    ]
+    assert not [each for each in found(tmp_path, dragged).values() if each.name == "increments" and each.refuses]
 
 
 @pytest.mark.parametrize(
