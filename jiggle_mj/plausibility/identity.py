@@ -1,4 +1,4 @@
-"""Identity of measured points over the frames: rows that change places, and places that stand for lost points.
+"""Identity of measured points over the frames: rows that change places, marks of lost points, and wild ones.
 
 A point of a sheet moves nearly as its neighbours do. One that jumps away from them has lost its identity: it is where
 another one should be, or where lost points are put. Compares consecutive frames alone; needs points that lie some
@@ -24,7 +24,10 @@ MIXED_EXTENT, MIXED_SPACINGS = 0.2, 2.0
 sheet that moved so would be torn, and noise of that size shows no sheet."""
 ISOLATED = 5.0
 """Distance to the nearest other point, above which one is isolated [spacings]: of points that are strewn at random, one
-in thirty million."""
+in thirty million. One that jumps so far from its neighbours is wild: the sheet would be torn."""
+LEAST_LOST = 3
+"""Points that come to one coordinate from which it stands for a lost one: of two wild ones it may be chance where
+coordinates are rounded."""
 SAME_PLACE_M = 1e-9
 """Rounding of a place [m]: of the transformation into the world, and finer than any measurement."""
 
@@ -46,6 +49,10 @@ class PointIdentity:
         """Points that are far from all others at rest [m]."""
         self._last: Float[np.ndarray, "n 3"] = np.empty((0, 3))
         self._visitors: defaultdict[Place, set[int]] = defaultdict(set)
+        self._arrivals: defaultdict[tuple[int, float], set[int]] = defaultdict(set)
+        self._jumped: set[int] = set()
+        self.wild: dict[int, float] = {}
+        """Farthest jump away from its neighbours of each point that makes a wild one [m]."""
         self._exchanged: set[int] = set()
         self.exchange_frames = 0
         """Frames in which points change places."""
@@ -62,6 +69,17 @@ class PointIdentity:
         """Return the place to which most points jump, and their number; None where no two jump to one place."""
         place = max(self._visitors, key=lambda each: len(self._visitors[each]), default=None)
         return None if place is None or len(self._visitors[place]) < 2 else (place, len(self._visitors[place]))
+
+    @property
+    def lost_coordinate(self) -> tuple[int, float, int] | None:
+        """Return the axis whose coordinate most points jump to alone, that value, and their number; None for none.
+
+        At least half of the points that ever jump do: of those that are rounded some come to one value by chance.
+        """
+        (axis, value), rows = max(
+            self._arrivals.items(), key=lambda item: len(item[1]), default=((0, 0.0), set[int]())
+        )
+        return (axis, value, len(rows)) if len(rows) >= max(LEAST_LOST, len(self._jumped) / 2) else None
 
     def add(self, positions: Float[np.ndarray, "n 3"]) -> None:
         """Take the points of one more frame [m], NaN where unseen; rows are those of the frames before, or more."""
@@ -84,35 +102,71 @@ class PointIdentity:
         usual, size = float(np.median(stray)), float(np.ptp(before, axis=0).max())
         calm = usual < TAKEN * self._spacing
         mixed = usual > max(MIXED_EXTENT * size, MIXED_SPACINGS * self._spacing)
-        exchanged = jumped if mixed else self._exchanges(before + motion, after, jumped) if calm else jumped[:0]
+        exchanged = jumped if mixed else self._exchanges(before, motion, after, jumped) if calm else jumped[:0]
         if len(exchanged):
             self._exchanged |= set(rows[exchanged].tolist())
             self.exchange_frames += 1
             self.largest_exchange = max(self.largest_exchange, len(exchanged) / len(rows))
         if calm:
-            for row in np.setdiff1d(jumped, exchanged):
-                for place in (before[row], after[row]):
-                    self._visitors[_place(place)].add(int(rows[row]))
+            self._count(rows, before, before + motion, after, np.setdiff1d(jumped, exchanged))
+
+    def _count(
+        self,
+        rows: Int[np.ndarray, " m"],
+        before: Float[np.ndarray, "m 3"],
+        expected: Float[np.ndarray, "m 3"],
+        after: Float[np.ndarray, "m 3"],
+        jumped: Int[np.ndarray, " j"],
+    ) -> None:
+        """Note where points that jumped come from and go to: each row with its places, and where it should be [m]."""
+        for at in jumped:
+            row, off = int(rows[at]), np.abs(after[at] - expected[at])
+            self._jumped.add(row)
+            for place in (before[at], after[at]):
+                self._visitors[_place(place)].add(row)
+            axis = int(np.argmax(off))
+            if np.delete(off, axis).max() < TAKEN * self._spacing:
+                self._arrivals[axis, _place(after[at])[axis]].add(row)
+            if np.linalg.norm(off) > ISOLATED * self._spacing:
+                self.wild[row] = max(self.wild.get(row, 0.0), float(np.linalg.norm(off)))
 
     def _exchanges(
-        self, expected: Float[np.ndarray, "m 3"], after: Float[np.ndarray, "m 3"], jumped: Int[np.ndarray, " j"]
+        self,
+        before: Float[np.ndarray, "m 3"],
+        motion: Float[np.ndarray, "m 3"],
+        after: Float[np.ndarray, "m 3"],
+        jumped: Int[np.ndarray, " j"],
     ) -> Int[np.ndarray, " e"]:
-        """Return the points that have taken each other's places, in pairs or larger rings.
+        """Return the points that have taken each other's places, in pairs or larger rings, or all moved on by a row.
 
         Args:
-            expected: where the points should be [m].
+            before: where the points were [m].
+            motion: of the neighbours of each [m].
             after: where they are [m].
             jumped: those that jumped.
         """
-        distance, taken = KDTree(expected).query(after[jumped])
-        near = (np.asarray(distance) < TAKEN * self._spacing) & (taken != jumped)
-        points, taken = jumped[near], np.asarray(taken)[near]
+        others = self._taken(before, after)
+        if (others < 0).sum() <= len(jumped) and (others[jumped] >= 0).any():
+            return np.flatnonzero(others >= 0)  # a sheet that moves by a spacing comes to new places, and jumps nowhere
+        taken = self._taken(before + motion, after[jumped], jumped)
+        points, taken = jumped[taken >= 0], taken[taken >= 0]
         while len(points):
             ring = np.isin(taken, points) & np.isin(points, taken)
             if ring.all():
                 break
             points, taken = points[ring], taken[ring]
         return points
+
+    def _taken(
+        self,
+        places: Float[np.ndarray, "m 3"],
+        after: Float[np.ndarray, "j 3"],
+        points: Int[np.ndarray, " j"] | None = None,
+    ) -> Int[np.ndarray, " j"]:
+        """Return whose place each point is at [m], among all others; -1 where at none, or at its own."""
+        distance, taken = KDTree(places).query(after)
+        own = np.arange(len(after)) if points is None else points
+        return np.where((np.asarray(distance) < TAKEN * self._spacing) & (taken != own), taken, -1)
 
 
 def isolated(rest: Float[np.ndarray, "n 3"], spacing: float | None) -> Bool[np.ndarray, " n"]:

@@ -82,5 +82,6 @@ def _problems(found: StereoImages) -> Iterator[RecordingProblem]:
             name="image-rows",
             refuses=found.rows > REFUSED_ROWS_PX,
             text=f"what both cameras see lies in rows that are {found.rows:.3g} px apart (median) once the images are "
-            "rectified; calibrate the pair again, or give rectified images the calibration of rectified ones.",
+            "rectified; calibrate the pair again, give rectified images the calibration of rectified ones, or correct "
+            "the stamps of a camera whose images come late.",
         )

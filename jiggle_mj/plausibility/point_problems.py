@@ -6,7 +6,7 @@ docs/RECORDINGS.md has the names as a table.
 from collections.abc import Iterator
 
 from .identity import ISOLATED, Place, PointIdentity
-from .problem import RecordingProblem
+from .problem import RecordingProblem, metres
 
 MOST = 0.5
 """Share of a frame's points that change places from which rows are in another order; fewer are a tracker's mistakes."""
@@ -32,6 +32,21 @@ def _lost(identity: PointIdentity) -> Iterator[RecordingProblem]:
             refuses=True,
             text=f"{count} points jump to exactly {_named(place)} m at some time, and their neighbours do not: that "
             f"place stands for a lost point; {cure}.",
+        )
+    elif identity.lost_coordinate is not None:
+        axis, value, count = identity.lost_coordinate
+        yield RecordingProblem(
+            name="lost-mark",
+            refuses=True,
+            text=f"{count} points jump to {'xyz'[axis]} = {value:.6g} m at some time, and keep the other coordinates: "
+            "that value stands for a lost one, as of a depth; write NaN for the point there.",
+        )
+    elif identity.wild:
+        yield RecordingProblem(
+            name="wild",
+            refuses=False,
+            text=f"{len(identity.wild)} points jump up to {metres(max(identity.wild.values()))} away from their "
+            "neighbours at some time; leave them out there (write NaN, or name what rates the points as visibility).",
         )
     if len(identity.isolated):
         x, y, z = identity.isolated[0].tolist()

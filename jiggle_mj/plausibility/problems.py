@@ -79,8 +79,8 @@ def _use(survey: Survey) -> Iterator[RecordingProblem]:
     if survey.grip_share is not None and survey.grip_share > MAX_HELD:
         yield _problem(
             "grip-share",
-            f"the tool always holds {survey.grip_share:.0%} of the sheet's points, or more; is the radius of the grip in metres, and "
-            "are the held rows right?",
+            f"the tool always holds {survey.grip_share:.0%} of the sheet's points, or more; is the radius of the grip "
+            "in metres, and are the held rows right?",
             refuses=survey.grip_share == 1,
         )
     if survey.unseen is not None and survey.unseen > MAX_UNSEEN:
@@ -193,7 +193,8 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
                 "added, or one frame many times?",
             )
         elif survey.sensing == "points":
-            yield _warn("held-still", "points move, and those that the tool holds do not; are the held rows right?")
+            them = "those that the tool holds " + ("do not" if held is not None else "are never seen while it pulls")
+            yield _warn("held-still", f"points move, and {them}; are the held rows right?")
     still = held is not None and tool < STILL_SHARE * held
     apart = held is not None and survey.tool_gap_m is not None and survey.tool_gap_m > max(held, tool) + noise
     if survey.why_apart is not None:

@@ -69,7 +69,7 @@ def _frame_problem(fit: FrameFit, *, several: bool) -> RecordingProblem:
             # Points beside the grip move by a tenth of its displacement too, never by a hundredth. Limit: by a 25th in
             # several grasps they look like inches.
             refuses=several or fit.factor > 1 or fit.factor < NEVER_FOLLOWS,
-            text=f"{found} {unit}; give its positions in the unit of the points, or tool_unit (inches must be "
+            text=f"{found} {unit}; give both in one unit: correct unit or tool_unit, whichever is wrong (inches must be "
             "converted).",
         )
     return RecordingProblem(

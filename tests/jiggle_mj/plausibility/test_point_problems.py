@@ -106,6 +106,23 @@ def never_find(positions: np.ndarray) -> None:
     positions[:, 70] = -1.0
 
 
+def lose_depths(positions: np.ndarray) -> None:
+    positions += [0, 0, 0.15]
+    for k in range(1, len(positions)):
+        positions[k, 7 * k % len(REST), 2] = 0.0
+
+
+def go_wild(positions: np.ndarray) -> None:
+    rng = np.random.default_rng(5)
+    wild = rng.random(positions.shape[:2]) < 0.03
+    wild[:, list(HELD)] = wild[0] = False
+    positions[wild] += rng.normal(scale=0.1, size=(int(wild.sum()), 3))
+
+
+def shift_rows(positions: np.ndarray) -> None:
+    positions[8:] = np.roll(positions[8:], 1, axis=1)
+
+
 def in_order_of_x(positions: np.ndarray) -> None:
     for frame in positions:
         frame[:] = frame[np.argsort(frame[:, 0])]
@@ -121,14 +138,26 @@ def each_from_the_last(positions: np.ndarray) -> None:
         (exchange, set(), {"identities"}),
         (lose_one_a_frame, {"lost-mark"}, set()),
         (never_find, set(), {"isolated"}),
+        (go_wild, set(), {"wild"}),
     ],
 )
 def test_a_point_that_is_another_or_none_is_named(tmp_path, edit, refused, doubted):
     assert found(tmp_path, changed(edit))[1:] == (refused, doubted)
 
 
-def test_rows_in_another_order_are_refused(tmp_path):
-    assert "identities" in found(tmp_path, changed(in_order_of_x))[1]
+@pytest.mark.parametrize(
+    ("edit", "name"), [(in_order_of_x, "identities"), (shift_rows, "identities"), (lose_depths, "lost-mark")]
+)
+def test_points_of_which_most_are_wrong_are_refused(tmp_path, edit, name):
+    assert name in found(tmp_path, changed(edit))[1]
+
+
+def test_a_sheet_that_is_carried_from_0_has_no_lost_depth(tmp_path):
+    """Also where single points are wild meanwhile."""
+    positions = lifted(sd=0.0)
+    positions[5:] += [0, 0, 0.2]
+    positions[8, 3], positions[9, 50] = [0.3, 0.1, 0.0], [0.2, 0.3, 0.0]
+    assert "lost-mark" not in found(tmp_path, np.delete(positions, 5, axis=0))[1]
 
 
 def test_displacements_from_frame_to_frame_are_doubted_at_a_constant_speed(tmp_path):

@@ -133,7 +133,7 @@ def test_points_that_slip_are_explained_by_no_frame_and_no_clock(tmp_path):
 
 @pytest.mark.parametrize("slip", [0.04, 0.1, 0.001])
 def test_points_that_hardly_follow_over_several_grasps_are_no_unit(tmp_path, slip):
-    """Within each grasp the tool's motion seems to be in inches or cm, and it goes with the jaws from one to the next."""
+    """Within each grasp the tool's motion seems to be in inches or cm, and it goes with them to the next one."""
     assert "tool-unit" not in found(tmp_path, lifts(slip=slip, sd=2e-5))
 
 
