@@ -76,9 +76,7 @@ class PointIdentity:
 
         At least half of the points that ever jump do: of those that are rounded some come to one value by chance.
         """
-        (axis, value), rows = max(
-            self._arrivals.items(), key=lambda item: len(item[1]), default=((0, 0.0), set[int]())
-        )
+        (axis, value), rows = max(self._arrivals.items(), key=lambda item: len(item[1]), default=((0, 0.0), set[int]()))
         return (axis, value, len(rows)) if len(rows) >= max(LEAST_LOST, len(self._jumped) / 2) else None
 
     def add(self, positions: Float[np.ndarray, "n 3"]) -> None:

@@ -10,6 +10,7 @@ from ..observation import MeasuredPoints, ToolState
 from .grip_share import held_points
 from .identity import PointIdentity
 from .noise import NeighbourNoise, noise_of_difference
+from .repeated import RepeatedPositions
 
 MOST_MOVED = 95
 """Percentile over the points that counts as how far the points went: single wild points do not count."""
@@ -30,6 +31,10 @@ class PointMotion:
         self._neighbours: NeighbourNoise | None = None
         self.identity: PointIdentity | None = None
         """Rows that change places, and places of lost points; None before any frame."""
+        self.repeated: RepeatedPositions | None = None
+        """Positions that are written again while a point is lost; None before any frame."""
+        self.restarts = 0
+        """Frames in which all points are new ones, though there were others before."""
         self.rest: Float[np.ndarray, "n 3"] | None = None
         """First position of each point [m], NaN before it is seen."""
         self.largest = 0.0
@@ -87,8 +92,9 @@ class PointMotion:
             self._last_still = positions
         elif compare and self._neighbours is not None:
             self._neighbours.add(positions)
-        assert self.identity is not None
+        assert self.identity is not None and self.repeated is not None
         self.identity.add(positions)
+        self.repeated.add(positions)
         if not tool.closed or self._closing is None:
             return np.full(3, np.nan)
         moved = positions[self._held] - self._closing[self._held]
@@ -121,6 +127,7 @@ class PointMotion:
             self.rest = np.empty((0, 3))
         new = np.setdiff1d(points.track_id[points.track_id >= 0], self._ids)
         if len(new):
+            self.restarts += bool(len(self._ids)) and not np.isin(points.track_id, self._ids).any()
             self._ids = np.concatenate([self._ids, new])
             self.rest, self._last_still, self._closing = (
                 None if known is None else _with_rows(known, len(self._ids))
@@ -134,7 +141,9 @@ class PointMotion:
         first = np.isnan(self.rest[:, 0])
         self.rest[first] = positions[first]
         if self._neighbours is None or self.identity is None:
-            self._neighbours, self.identity = NeighbourNoise(self.rest), PointIdentity(self.rest, spacing(self.rest))
+            rest, apart = self.rest, spacing(self.rest)
+            self._neighbours, self.identity = NeighbourNoise(rest), PointIdentity(rest, apart)
+            self.repeated = RepeatedPositions(rest, apart)
         return positions
 
 

@@ -6,20 +6,33 @@ docs/RECORDINGS.md has the names as a table.
 from collections.abc import Iterator
 
 from .identity import ISOLATED, Place, PointIdentity
+from .point_motion import PointMotion
 from .problem import RecordingProblem, metres
+from .repeated import LEAST_RUN, RepeatedPositions
 
 MOST = 0.5
 """Share of a frame's points that change places from which rows are in another order; fewer are a tracker's mistakes."""
 
 
-def point_problems(identity: PointIdentity) -> Iterator[RecordingProblem]:
+def point_problems(motion: PointMotion) -> Iterator[RecordingProblem]:
     """Find points that lose their identity.
 
     Args:
-        identity: of the points, frame by frame.
+        motion: of the points, frame by frame.
     """
-    yield from _lost(identity)
-    yield from _exchanged(identity)
+    if motion.identity is not None:
+        yield from _lost(motion.identity)
+        yield from _exchanged(motion.identity)
+    if motion.repeated is not None:
+        yield from _repeated(motion.repeated)
+    if motion.restarts:
+        yield RecordingProblem(
+            name="new-tracks",
+            refuses=False,
+            text=f"in {motion.restarts} frames all points have numbers that no frame before has: did the tracker "
+            "start anew? The same track_id must be the same point throughout; points that first come while the sheet "
+            "is pulled are of no use.",
+        )
 
 
 def _lost(identity: PointIdentity) -> Iterator[RecordingProblem]:
@@ -55,6 +68,19 @@ def _lost(identity: PointIdentity) -> Iterator[RecordingProblem]:
             refuses=False,
             text=f"{len(identity.isolated)} points lie more than {ISOLATED:g} spacings from any other at rest, the "
             f"first at {_named((x, y, z))} m: where that place stands for a lost point, {cure}; else leave it out.",
+        )
+
+
+def _repeated(repeated: RepeatedPositions) -> Iterator[RecordingProblem]:
+    """Find points that look attached, as their last position is written while they are lost."""
+    if repeated.farthest:
+        yield RecordingProblem(
+            name="repeated",
+            refuses=False,
+            text=f"{len(repeated.farthest)} points keep their position to the last digit for {LEAST_RUN} frames or "
+            f"more while their neighbours go up to {metres(max(repeated.farthest.values()))}: if the tracker writes "
+            "the last position of a lost point, write NaN there, or name what rates the points as visibility; they "
+            "look attached.",
         )
 
 

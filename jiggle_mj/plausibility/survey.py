@@ -153,8 +153,7 @@ def survey(recording: Recording) -> Survey:
     sd, apart = noise_sd or 0.0, None if rest is None else spacing(rest)
     why = None if closed.by_points else why_apart(track, noise_sd=sd)
     doubts = list[RecordingProblem]()
-    if motion.identity is not None:
-        doubts += point_problems(motion.identity)
+    doubts += point_problems(motion)
     if rest is not None:
         gravity = np.array(recording.declaration.gravity)
         if not closed.by_points:

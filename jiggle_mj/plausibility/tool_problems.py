@@ -66,11 +66,10 @@ def _frame_problem(fit: FrameFit, *, several: bool) -> RecordingProblem:
     if same_axes:
         return RecordingProblem(
             name="tool-unit",
-            # Points beside the grip move by a tenth of its displacement too, never by a hundredth. Limit: by a 25th in
-            # several grasps they look like inches.
+            # Points beside the grip move by a tenth of its displacement too, never by a hundredth.
             refuses=several or fit.factor > 1 or fit.factor < NEVER_FOLLOWS,
-            text=f"{found} {unit}; give both in one unit: correct unit or tool_unit, whichever is wrong (inches must be "
-            "converted).",
+            text=f"{found} {unit}; give both in one unit: correct unit or tool_unit, whichever is wrong (inches "
+            "must be converted).",
         )
     return RecordingProblem(
         name="tool-axes",

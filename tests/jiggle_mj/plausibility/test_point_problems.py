@@ -119,6 +119,12 @@ def go_wild(positions: np.ndarray) -> None:
     positions[wild] += rng.normal(scale=0.1, size=(int(wild.sum()), 3))
 
 
+def repeat_the_last(positions: np.ndarray) -> None:
+    """Half of the points near the held ones are lost half way up."""
+    near = np.flatnonzero(np.linalg.norm(REST, axis=1) < 20e-3)
+    positions[9:, near[::3]] = positions[8, near[::3]]
+
+
 def shift_rows(positions: np.ndarray) -> None:
     positions[8:] = np.roll(positions[8:], 1, axis=1)
 
@@ -139,6 +145,7 @@ def each_from_the_last(positions: np.ndarray) -> None:
         (lose_one_a_frame, {"lost-mark"}, set()),
         (never_find, set(), {"isolated"}),
         (go_wild, set(), {"wild"}),
+        (repeat_the_last, set(), {"repeated"}),
     ],
 )
 def test_a_point_that_is_another_or_none_is_named(tmp_path, edit, refused, doubted):
@@ -190,6 +197,19 @@ def test_points_that_are_the_same_are_not_doubted(tmp_path, edit):
     """Also where every point comes to the very place of its neighbour, as all do."""
     doubted = {problem.name for problem in found(tmp_path, changed(edit))[0].doubts}
     assert not doubted & {"identities", "lost-mark", "isolated", "increments"}
+
+
+def test_attached_points_without_noise_are_not_repeated(tmp_path):
+    """As a simulation writes them: they never move, and those that the lift does not reach hardly do."""
+    positions = np.round(lifted(sd=0.0), 6)
+    positions[:, 2:4] = REST[2:4]
+    assert "repeated" not in found(tmp_path, positions)[2]
+
+
+def test_a_tracker_that_starts_anew_is_named(tmp_path):
+    rows = np.arange(len(REST))
+    tracks = [rows[:60] if k < 8 else rows[60:] for k in range(N_STILL + N_CLOSED)]
+    assert "new-tracks" in found(tmp_path, lifted(), tracks=tracks)[2]
 
 
 def test_noise_of_a_fifth_of_the_spacing_is_no_exchange(tmp_path):
