@@ -43,8 +43,8 @@ class RepeatedPositions:
         if not len(now):
             return
         step = now - self._last
-        seen = np.isfinite(step).all(axis=1)
-        same = seen & ~step.any(axis=1)
+        seen = np.asarray(np.isfinite(step).all(axis=1))
+        same = np.asarray(seen & ~step.any(axis=1))
         self._run = np.where(same, self._run + 1, 0)
         self._moved |= seen & ~same
         self._passed = np.where(same[:, np.newaxis], self._passed + self._around_them(step, seen), 0.0)

@@ -138,13 +138,15 @@ def jaw_states(
         topic: name of the topic, for the message.
 
     Raises:
-        RecordingError: numbers without a rule.
+        RecordingError: numbers without a rule, or a rule for messages that are no numbers.
     """
     if rule is None and "open" in topic.lower() and values and isinstance(values[0], bool):
         raise RecordingError(
             f"the name of {topic} says open, not closed; give --closed 'data==false' if true means open, else "
             "--closed 'data==true'."
         )
+    if values and rule is not None:
+        _refuse_rule(values[0], rule, topic)
     if values and isinstance(values[0], dict):
         return [JawState(time=time, **value) for time, value in zip(stamps, values, strict=True)], 0
     numbers = [float(value) for value in values]
@@ -162,6 +164,21 @@ def jaw_states(
         states.append(JawState(time=stamps[k], closed=closed[k], grasp=grasp))
     n_short = sum(after.time - state.time < SHORT_HOLD for state, after in pairwise(states) if state.closed)
     return states, n_short
+
+
+def _refuse_rule(value: Any, rule: ClosedRule, topic: str) -> None:
+    """Refuse a rule for messages that say themselves whether the jaws are closed, but one that is their opposite.
+
+    Raises:
+        RecordingError: such a rule.
+    """
+    if isinstance(value, dict):
+        raise RecordingError(f"{topic} says itself when the jaws are closed; leave --closed out.")
+    if isinstance(value, bool) and rule.comparison != ALWAYS and (rule.comparison != "==" or rule.limit not in (0, 1)):
+        raise RecordingError(
+            f"{topic} is a Bool, and --closed compares numbers: leave it out where true means closed, or give --closed "
+            "'data==false'."
+        )
 
 
 def state_at(states: Sequence[JawState], time: int) -> JawState:

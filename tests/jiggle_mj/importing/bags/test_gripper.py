@@ -52,6 +52,20 @@ def test_joints_and_numbers_without_a_rule_are_refused_with_what_they_hold():
         jaw_states([0, 1], [0.1, 0.9], None, "/width")
 
 
+@pytest.mark.parametrize("rule", ["jaw<0.1", "data==0.5", "data>0"])
+def test_a_bool_takes_no_rule_of_numbers(rule: str):
+    """False is below 0.1, so that the jaws would be taken the other way round."""
+    with pytest.raises(RecordingError, match="is a Bool.*leave it out where true means closed"):
+        jaw_states([0, 1], [True, False], ClosedRule.parse(rule), "/closed")
+    opposite, _ = jaw_states([0, 1], [True, False], ClosedRule.parse("data==false"), "/closed")
+    assert [state.closed for state in opposite] == [False, True]
+
+
+def test_a_message_of_our_own_schema_takes_no_rule():
+    with pytest.raises(RecordingError, match="/tool/grasp says itself"):
+        jaw_states([0], [{"closed": True, "grasp": 1}], ClosedRule.parse("always"), "/tool/grasp")
+
+
 def test_grasps_are_counted_by_their_closings():
     states, n_short = jaw_states([0, 10**9, 2 * 10**9, 3 * 10**9], [False, True, False, True], None, "/closed")
     assert [(state.closed, state.grasp) for state in states] == [(False, 0), (True, 1), (False, 1), (True, 2)]
