@@ -24,8 +24,9 @@ from jiggle_mj.errors import JiggleError
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from tests.support.damaged_files import READERS, Reader, damaged
+from tests.support.damaged_files import damaged
 from tests.support.damaged_imports import IMPORTS
+from tests.support.valid_files import READERS, Reader
 
 HANG_S = 10
 """Time after which a reading counts as a hang [s]."""

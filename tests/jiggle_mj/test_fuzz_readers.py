@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jiggle_mj.errors import JiggleError
-from tests.support.damaged_files import READERS, damaged
+from tests.support.damaged_files import damaged
 from tests.support.damaged_imports import IMPORTS
+from tests.support.valid_files import READERS
 
 MAX_MESSAGE = 1000
 """Longest message [characters]: 200 of the content, twice, and the path."""

@@ -11,9 +11,9 @@ from scipy.io import savemat
 
 from jiggle_mj.importing.bags.importer import import_bag
 from jiggle_mj.importing.folder import import_folder
-from tests.support.damaged_files import Reader
 from tests.support.measured_folder import GRID_FACES, TOML, grid
 from tests.support.robot_bags import Kind, small_bag
+from tests.support.valid_files import Reader
 
 FILES = 'files = ["rest.xyz", "pulled_*.xyz"]'
 

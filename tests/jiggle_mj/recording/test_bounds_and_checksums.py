@@ -131,7 +131,7 @@ def test_pickled_arrays_are_never_loaded():
     ],
 )
 def test_a_declared_mesh_of_wrong_arrays_is_refused(tmp_path, name, array, complaint):
-    from tests.support.damaged_files import packed
+    from tests.support.valid_files import packed
 
     path = write(tmp_path / "run.mcap", observations(1), declaration=Declaration(mesh=declared_mesh()))
     changed = []
