@@ -4,11 +4,9 @@ Each fills a folder with the files of an experiment. The truth, if there is one,
 written.
 """
 
-import platform
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +17,6 @@ from jiggle_mj.episode import (
     RECORDING,
     REPORT,
     RESULT,
-    Episode,
     OnFrame,
     Stopwatch,
     check_directory,
@@ -30,16 +27,13 @@ from jiggle_mj.episode import (
     recording_identity,
     settings,
 )
-from jiggle_mj.errors import OutputError, PerceptionError, RecordingError
+from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import Disparity, FrameMask, TissueMask
 from jiggle_mj.estimator.planning.policy import INTERRUPTED, Policy
-from jiggle_mj.observation import StereoPair
-from jiggle_mj.recording.estimate import EstimateRecording, read_estimate
 from jiggle_mj.recording.mcap_files import truth_path
 from jiggle_mj.recording.output_files import fills_folder
 from jiggle_mj.recording.reader import PAIRING_TOLERANCE_NS, Recording
-from jiggle_mj.truth import Truth
 
 from ..metrics.result import Run, result, score_read
 from ..metrics.result_file import (
@@ -47,21 +41,17 @@ from ..metrics.result_file import (
     RECORDED,
     TOLERANCE,
     Json,
-    pairing_tolerance,
     read_scorable,
     write_result,
 )
-from ..report.run_page import shown_steps, write_report
 from .acting import actions, acts, check_policy_fits, policy_named
 from .check_before import check_before
+from .folder_report import write_folder_report
 from .settings_used import settings_used, with_declared
 
 if TYPE_CHECKING:
     from jiggle_mj.options import Sensing
     from jiggle_mj.scenes import Scene
-
-REPORTED_PACKAGES = ("jiggle-mj", "mujoco", "jax", "numpy", "scipy", "opencv-python-headless")
-"""Packages whose versions are in the report: those that can change a figure."""
 
 
 @fills_folder
@@ -161,7 +151,7 @@ def run_scene(
     write_result(directory / RESULT, result(run))
     unscored, estimated, truth = read_scorable(directory, truth_path(directory / RECORDING))
     scored = score_read(directory, unscored, estimated, truth)
-    _report(directory, episode, scored, recording=directory / RECORDING, truth=truth)
+    write_folder_report(directory, episode, scored, recording=directory / RECORDING, truth=truth)
     return scored
 
 
@@ -226,44 +216,7 @@ def run_estimator(
     )
     figures = result(run)
     write_result(directory / RESULT, figures)
-    _report(directory, episode, figures, recording=recording_path, tolerance_ns=tolerance_ns)
-    return figures
-
-
-def score_directory(
-    directory: Path,
-    truth: Path,
-    *,
-    recording: Path | None = None,
-    allow_truncated: bool = False,
-    log: Callable[[str], None] = lambda _: None,
-) -> Json:
-    """Score an estimate in a folder, and write its report again with the truth.
-
-    Args:
-        directory: the folder.
-        truth: the truth file.
-        recording: what was estimated, for the report's pictures; if None, it is searched next to the truth file and in
-            the folder.
-        allow_truncated: use the complete frames of a truth that was cut off.
-        log: gets a line if the report loses its pictures.
-
-    Raises:
-        RecordingError: the folder holds no estimate, the file no truth, or one of another recording.
-        OutputError: the estimate did not finish.
-    """
-    unscored, estimated, opened = read_scorable(directory, truth, allow_truncated=allow_truncated)
-    if recording is not None and not _is_of(estimated, recording):
-        raise RecordingError(f"{recording} is not the recording that {directory} estimates; give that one, or none.")
-    figures = score_read(directory, unscored, estimated, opened)
-    if recording is None:
-        sibling = truth.with_name(truth.name.replace(".truth.", "."))
-        candidates = (path for path in (sibling, directory / RECORDING) if path != truth and path.exists())
-        recording = next((path for path in candidates if _is_of(estimated, path)), None)
-    if recording is None and figures["sensing"] == "stereo":
-        log("the recording is not next to the truth: the report has no pictures; pass --recording for them")
-    tolerance_ns = pairing_tolerance(estimated)
-    _report(directory, estimated, figures, recording=recording, truth=opened, tolerance_ns=tolerance_ns)
+    write_folder_report(directory, episode, figures, recording=recording_path, tolerance_ns=tolerance_ns)
     return figures
 
 
@@ -272,50 +225,3 @@ def _ended(policy: Policy | None, *, interrupted: bool) -> str | None:
     if policy is None:
         return INTERRUPTED if interrupted else None
     return policy.ended
-
-
-def _is_of(read: EstimateRecording, recording: Path) -> bool:
-    """Say whether an estimate is of this recording, by name and identity."""
-    tolerance_ns = pairing_tolerance(read)
-    about = Recording.open(recording, allow_truncated=True, tolerance_ns=tolerance_ns).metadata
-    same = about.get("name", recording.stem) == read.metadata.get(RECORDED)
-    return same and about.get("identity", "") == read.metadata.get(IDENTITY, "")
-
-
-def _report(
-    directory: Path,
-    estimated: Episode | EstimateRecording,
-    figures: Json,
-    *,
-    recording: Path | None,
-    truth: Truth | None = None,
-    tolerance_ns: int = PAIRING_TOLERANCE_NS,
-) -> None:
-    """Write report.html; the pictures come from the recording, if there is one with images."""
-    if estimated.belief is None or estimated.detection is None:
-        raise OutputError(f"{directory / ESTIMATE} ends before its belief; estimate the recording again.")
-    opened = None if recording is None else Recording.open(recording, allow_truncated=True, tolerance_ns=tolerance_ns)
-    settings: dict[str, object] = {"estimate": dict(read_estimate(directory / ESTIMATE).metadata)}
-    used = figures.get("settings")
-    if isinstance(used, dict):
-        settings["declared"] = {
-            name: f"{entry['value']} ({entry['from']})" for name, entry in used["declaration"].items()
-        }
-    settings["versions"] = {name: version(name) for name in REPORTED_PACKAGES} | {"python": platform.python_version()}
-    pairs: dict[int, StereoPair] = {}
-    if opened is not None and opened.camera is not None:
-        steps = shown_steps(estimated.estimates, estimated.sheet.rest)
-        shown = {estimated.estimates[step].index for step in steps}
-        pairs = {frame.index: frame.images for frame in opened if frame.index in shown and frame.images is not None}
-    write_report(
-        directory / REPORT,
-        sheet=estimated.sheet,
-        estimates=estimated.estimates,
-        belief=estimated.belief,
-        detection=estimated.detection,
-        result=figures,
-        settings=settings,
-        truth=truth,
-        images=pairs.get if pairs else None,
-        camera=None if opened is None else opened.camera,
-    )

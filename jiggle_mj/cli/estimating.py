@@ -280,7 +280,7 @@ def score(
         allow_truncated: use the complete frames of a truth that was cut off.
         as_json: print result.json to stdout.
     """
-    from jiggle_mj.eval.runs.experiment import score_directory
+    from jiggle_mj.eval.runs.scoring import score_directory
 
     if directory.exists() and not truth.exists():
         raise RecordingError(f"{truth} does not exist; 'import' writes one where recording.toml has a [truth].")

@@ -1,35 +1,26 @@
 """Reading recordings: MCAP files that hold what an estimator may see, and nothing else.
 
 The topics are in docs/RECORDINGS.md. A frame that fails a check is named and skipped. Does not rectify, resample or
-interpolate; `contents` says which messages a file may hold, `pairing` which of them belong together.
+interpolate; `contents` says which messages a file may hold, `pairing` which of them belong together, and
+`observation_reader` decodes them.
 """
 
 import math
 import os
-from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Container, Iterator
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Self
-
-import numpy as np
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from ..argument_checks import as_path
 from ..camera import StereoCamera
 from ..errors import RecordingError
-from ..observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolReport, ToolState
-from ..toml_kinds import MAX_COUNT
+from ..observation import Declaration, Observation
 from .contents import RecordingContents
 from .frames import transform_of_rotation
-from .images import decode_image, refuse_other_size
+from .observation_reader import ObservationReader
 from .pairing import MAX_PAIRING_TOLERANCE_MS, MessageGroup, Stamped, group_messages, lone_jumps, stamp_gap
-from .schemas import parse_calibration, parse_points, parse_transform
-from .stored_arrays import MAX_LENGTH_M, StoredArrays
+from .schemas import parse_calibration
 from .topics import GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO
 
 PAIRING_TOLERANCE_NS = 5_000_000
@@ -38,12 +29,6 @@ MAX_POSE_AGE_NS = 100_000_000
 """Default age above which a tool pose no longer says where the tool is [ns]."""
 MAX_SEED_DIGITS = 20
 """Longest seed that is read: 64 bits."""
-MAX_SPAN_M = 20.0
-"""Largest extent of a cloud [m]: a room. A sheet of 2 cm and more is larger in millimetres."""
-MAX_SD_M = 1.0
-"""Largest standard deviation of a point [m]; a hundredth of it already hides every pull."""
-EQUAL_SD = 1e-6
-"""Largest relative difference of two standard deviations that count as one: the rounding of float32."""
 
 
 class Recording:
@@ -173,106 +158,6 @@ class Recording:
                 group = next(coming, None)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ObservationReader:
-    """Decoder of the messages of one group into an observation in the world frame."""
-
-    contents: RecordingContents
-    """The file that holds frames, poses and grasps."""
-    camera: StereoCamera | None
-    """The calibrated stereo camera; None where the recording has points only."""
-    poses: list[Stamped]
-    """Every tool pose of the file, by stamp."""
-    origin: int
-    """Stamp that counts as time 0 [ns]."""
-    max_pose_age: int
-    """Age above which a tool pose no longer says where the tool is [ns]."""
-
-    def read(self, index: int, group: MessageGroup, messages: dict[str, Any], *, images: bool = True) -> Observation:
-        """Decode one group; its events and reports are added by `Recording`.
-
-        Args:
-            index: position of the group in the recording.
-            group: which messages belong together.
-            messages: the encoded images and points by topic.
-            images: whether to decode the images.
-
-        Raises:
-            RecordingError: half of a stereo pair is missing, an image cannot be decoded or has another size than its
-                calibration, a pose is not one, a frame is not joined to the world, the tool pose is missing or too old.
-        """
-        pair = None
-        if images and (group.left is not None or group.right is not None):
-            pair = self._images(messages)
-        points = self._points(messages[POINTS]) if POINTS in messages else None
-        return Observation(
-            index=index,
-            time=group.stamp - self.origin,
-            tool=self._tool(group),
-            images=pair,
-            points=points,
-        )
-
-    def reports(self, after: Stamped | None, until: Stamped | None) -> tuple[ToolReport, ...]:
-        """Return the tool's reports strictly between the poses of two observations; malformed poses are left out."""
-        if until is None:
-            return ()
-        reports, begin = [], 0 if after is None else bisect_right(self.poses, after)
-        for pose in self.poses[begin : bisect_left(self.poses, until)]:
-            with suppress(RecordingError):
-                tip = self._T_world_tip(self.contents.poses[pose.ordinal])[:3, 3]
-                reports.append(ToolReport(time=pose.stamp - self.origin, position=tip))
-        return tuple(reports)
-
-    def _images(self, messages: dict[str, Any]) -> StereoPair:
-        assert self.camera is not None
-        decoded = []
-        for topic, calibration in ((LEFT, self.camera.left), (RIGHT, self.camera.right)):
-            if topic not in messages:
-                raise RecordingError(f"missing half of the stereo pair: {topic}")
-            try:
-                image = decode_image(messages[topic])
-            except RecordingError as failure:
-                raise RecordingError(f"{topic} {failure}") from failure
-            refuse_other_size(image, calibration, topic)
-            decoded.append(image)
-        return StereoPair(left=decoded[0], right=decoded[1])
-
-    def _points(self, message: PointCloud) -> MeasuredPoints:
-        columns = StoredArrays(parse_points(message, POINTS), POINTS)
-        T = self.contents.frames.T_world(message.frame_id, POINTS) @ parse_transform(message.pose)
-        positions = np.column_stack([columns.numbers(name, (None,)) for name in "xyz"])
-        positions[~np.isfinite(positions).all(axis=1)] = np.nan
-        _refuse_span(positions)
-        if not np.array_equal(T, np.eye(4)):
-            positions = positions @ T[:3, :3].T + T[:3, 3]
-        known = {}
-        if "sd" in columns and len(positions):
-            known["sd"] = _common_sd(columns.numbers("sd", (None,)))
-        track = None
-        if "track_id" in columns:
-            track = columns.indices("track_id", (None,), from_=-MAX_COUNT, below=MAX_COUNT)
-        return MeasuredPoints(positions=positions, track_id=track, **known)
-
-    def _T_world_tip(self, pose: PoseInFrame) -> Float[np.ndarray, "4 4"]:
-        return self.contents.frames.T_world(pose.frame_id, POSE) @ parse_transform(pose.pose)
-
-    def _tool(self, group: MessageGroup) -> ToolState:
-        if group.pose is None or group.grasp is None:
-            raise RecordingError("no tool pose or grasp has come yet")
-        age = group.stamp - group.pose.stamp
-        if age > self.max_pose_age:
-            raise RecordingError(f"the latest tool pose is {age / 1e6:g} ms old")
-        pose = self.contents.poses[group.pose.ordinal]
-        T = self.contents.frames.T_world(pose.frame_id, POSE)
-        T_world_tip = self._T_world_tip(pose)
-        orientation = pose.pose.orientation
-        quat_wxyz = np.array([orientation.w, orientation.x, orientation.y, orientation.z])
-        if not (quat_wxyz.any() and np.array_equal(T, np.eye(4))):
-            quat_wxyz = Rotation.from_matrix(T_world_tip[:3, :3]).as_quat(scalar_first=True)
-        return ToolState(position=T_world_tip[:3, 3], quat_wxyz=quat_wxyz, **self.contents.grasps[group.grasp.ordinal])
-
-
 def _parts(group: MessageGroup) -> list[tuple[str, Stamped]]:
     """Return the images and points of a group, which are decoded later, with their topics."""
     parts = ((LEFT, group.left), (RIGHT, group.right), (POINTS, group.points))
@@ -310,29 +195,3 @@ def _read_camera(contents: RecordingContents) -> StereoCamera:
         right=parse_calibration(right, RIGHT_INFO),
         T_world_camera=T_world_left @ transform_of_rotation(calibration.R.T),
     )
-
-
-def _refuse_span(positions: Float[np.ndarray, "m 3"]) -> None:
-    """Refuse a cloud that is larger than any sheet or scene; it is the likeliest one in millimetres."""
-    seen = positions[~np.isnan(positions[:, 0])]
-    if len(seen) and (np.abs(seen) > MAX_LENGTH_M).any():
-        raise RecordingError(f"{POINTS} has a point beyond {MAX_LENGTH_M:g} m")
-    span = float(np.ptp(seen, axis=0).max()) if len(seen) else 0.0
-    if span > MAX_SPAN_M:
-        raise RecordingError(
-            f"{POINTS} spans {span:.4g} m; PointCloud is in metres, and at most {MAX_SPAN_M:g} m are read (is it in "
-            f"millimetres? then it spans {span / 1e3:.4g} m)"
-        )
-
-
-def _common_sd(sd: Float[np.ndarray, " m"]) -> float:
-    """Return the standard deviation that all points of a cloud share [m]; refuse two different ones."""
-    finite = sd[np.isfinite(sd)]
-    low, high = (finite.min(), finite.max()) if len(finite) else (np.nan, np.nan)
-    if high > low * (1 + EQUAL_SD):
-        raise RecordingError(f"{POINTS} has sd from {low:g} to {high:g} m; all points of a cloud must share one.")
-    if low > MAX_SD_M:
-        raise RecordingError(
-            f"{POINTS} has an sd of {low:g} m; at most {MAX_SD_M:g} m are read (is it in millimetres?)"
-        )
-    return float(low)

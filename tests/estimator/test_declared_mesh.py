@@ -11,7 +11,8 @@ from jiggle_mj.estimator.belief.prior import PriorConfig
 from jiggle_mj.estimator.physics.energy import SheetEnergy
 from jiggle_mj.estimator.physics.environment import Grip
 from jiggle_mj.estimator.physics.surrogate import surrogate
-from jiggle_mj.eval.runs.experiment import run_estimator, score_directory
+from jiggle_mj.eval.runs.experiment import run_estimator
+from jiggle_mj.eval.runs.scoring import score_directory
 from jiggle_mj.importing.folder import import_folder
 from jiggle_mj.observation import Declaration
 from jiggle_mj.recording.estimate import read_estimate
