@@ -62,7 +62,7 @@ class UndeclaredStudy(Study[UndeclaredCell, Discrepancy]):
         with Reference(scene, seed=cell.seed, sensing=ROWS[cell.row].sensing) as reference:
             for _ in observe(reference, programme(scene), recording, seed=cell.seed, overwrite=True):
                 pass
-        close_loop(recording, path, truth=truth_path(recording), overwrite=True, allow_implausible=True)
+        close_loop(recording, path, truth=truth_path(recording), overwrite=True)
 
     def is_current(self, cell: UndeclaredCell, path: Path) -> bool:
         """Say whether this version wrote the folder's discrepancy.json."""
