@@ -9,6 +9,7 @@ import tyro
 from rich.table import Column, Table
 
 from ..errors import OptionError
+from .init import refuse_no_folder
 from .options import AsJson, Out, PathArgument
 from .survey import show_survey
 from .terminal import console
@@ -85,6 +86,7 @@ def import_(
     given = [name for name, value in {"topics": topics, **options}.items() if value not in (None, (), False)]
     if given:
         raise OptionError(f"--{given[0].replace('_', '-')} is for a bag, and {path} is none.")
+    refuse_no_folder(path)
     _import_folder(path, recording, out, overwrite=overwrite, allow_outside=allow_outside, as_json=as_json)
 
 
@@ -109,14 +111,14 @@ def inspect(
     from ..importing.bags.inspection import inspect_bag
 
     report = inspect_bag(path, _settings(topics, {"topic": topic, "allow_truncated": allow_truncated}))
-    heads = ("topic", "type", "messages", "Hz", "from [s]", "to [s]", "frames", "role")
-    table = Table(*(Column(head, overflow="fold") for head in heads), box=None)
+    heads = ("topic", "type", "messages", "Hz", "from [s]", "to [s]", "role", "frames")
+    table = Table(*(Column(head, overflow="fold", no_wrap=head == "topic") for head in heads), box=None)
     for each in report.topics:
         begin, end = ("-", "-") if each.span is None else (f"{time:.3f}" for time in each.span)
         rate = "-" if each.rate is None else f"{each.rate:.4g}"
-        shown = each.type.replace("/msg/", "/") + ("" if each.stamped is not False else " (no stamp)")
+        shown = each.type.rpartition("/")[2] + ("" if each.stamped is not False else " (no stamp)")
         table.add_row(
-            each.name, shown, str(each.count), rate, begin, end, ", ".join(each.frames) or "-", each.role or "-"
+            each.name, shown, str(each.count), rate, begin, end, each.role or "-", ", ".join(each.frames) or "-"
         )
     console.print(f"{path}: a {report.kind}")
     console.print(table)

@@ -3,8 +3,24 @@
 import json
 from pathlib import Path
 
+from ..errors import OptionError
 from .options import AsJson, PathArgument
 from .terminal import console
+
+
+def refuse_no_folder(path: Path) -> None:
+    """Refuse what is no folder where one of measured points is due.
+
+    Raises:
+        OptionError: there is no such folder, or it is a file; the message says what to give.
+    """
+    if not path.exists():
+        raise OptionError(f"{path} does not exist; give the folder of the data files.")
+    if not path.is_dir():
+        raise OptionError(
+            f"{path} is a file; give its folder. Is more in it than one recording? Put this one's files into a folder "
+            "of their own; 'jiggle-mj init FOLDER' describes them."
+        )
 
 
 def init(folder: PathArgument, /, *, as_json: AsJson = False) -> None:
@@ -16,9 +32,15 @@ def init(folder: PathArgument, /, *, as_json: AsJson = False) -> None:
         folder: folder of the data files.
         as_json: print the path and what is still refused to stdout as JSON.
     """
+    from ..importing.bags.bag_paths import is_bag
     from ..importing.init import describe_folder
+    from ..recording.bag_refusal import refuse_bag
 
-    description = describe_folder(Path(folder))
+    refuse_bag(folder)
+    if folder.is_file() and is_bag(folder):
+        raise OptionError(f"{folder} needs no recording.toml: 'jiggle-mj inspect {folder}' names the next command.")
+    refuse_no_folder(folder)
+    description = describe_folder(folder)
     console.print(description.text, highlight=False, soft_wrap=True)
     console.print(f"wrote {description.path}: check the lines above", highlight=False, soft_wrap=True)
     if description.problem is None:

@@ -68,6 +68,35 @@ def test_a_verb_that_needs_a_recording_names_the_command(tmp_path, monkeypatch, 
     assert f"import it first: jiggle-mj import {path} --out run.mcap" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("verb", "given", "code", "says"),
+    [
+        ("init", "tracks.npz", 2, "tracks.npz is a file; give its folder"),
+        ("import", "tracks.npz", 2, "tracks.npz is a file; give its folder"),
+        ("init", "missing", 2, "missing does not exist; give the folder"),
+        ("import", "missing", 2, "missing does not exist; give the folder"),
+        ("init", "run.mcap", 2, "run.mcap' names the next command"),
+        ("init", "bag", 1, "import it first: jiggle-mj import"),
+    ],
+)
+def test_what_is_no_folder_of_points_is_named_with_what_to_do(tmp_path, monkeypatch, capsys, verb, given, code, says):
+    for name in ("tracks.npz", "run.mcap"):
+        (tmp_path / name).touch()
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").touch()
+    out = () if verb == "init" else ("--out", tmp_path / "out.mcap")
+    assert call(monkeypatch, verb, tmp_path / given, *out) == code
+    assert says in capsys.readouterr().err
+
+
+def test_inspect_never_breaks_the_name_of_a_topic(tmp_path, monkeypatch, capsys):
+    name = "/endoscope/of/a/robot/" + "x" * 30
+    with RobotBag(tmp_path / "bag") as bag:
+        bag.pose(name, 0, [0, 0, 0])
+    assert call(monkeypatch, "inspect", bag.path) == 0
+    assert f" {name} " in capsys.readouterr().err
+
+
 def test_options_of_bags_and_folders_are_not_mixed(tmp_path, monkeypatch, capsys):
     for path, option in ((small_bag(tmp_path / "bag"), "--recording"), (tmp_path, "--closed")):
         assert call(monkeypatch, "import", path, option, "x", "--out", tmp_path / "run.mcap") == 2
