@@ -166,7 +166,10 @@ def iterate_records(
         raise RecordingError(_unreadable(path, failure)) from failure
     with file:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise RecordingError(f"{path} is not an MCAP file (it does not begin with the magic bytes of MCAP).")
+            raise RecordingError(
+                f"{path} is not an MCAP file (it does not begin with the magic bytes of MCAP); measured points become "
+                "a recording by 'jiggle-mj import FOLDER --out run.mcap'."
+            )
         end, complete = _end_of_records(file)
         if not complete and not allow_truncated:
             raise RecordingError(
@@ -199,6 +202,8 @@ def _unreadable(path: Path, failure: OSError | ValueError) -> str:
             f"{path} is not complete: its run was interrupted, or still goes on. Read what there is with "
             f"--allow-truncated from {partial_path(path)}."
         )
+    if isinstance(failure, IsADirectoryError):
+        return f"{path} is a folder; 'jiggle-mj import {path} --out run.mcap' makes a recording of measured points."
     return f"{path} cannot be read: {reason}."
 
 

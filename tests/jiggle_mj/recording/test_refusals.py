@@ -68,6 +68,13 @@ def test_a_file_without_a_needed_topic_is_refused(tmp_path):
         Recording.open(bag.output.path)
 
 
+def test_measured_points_are_sent_to_import(tmp_path):
+    (tmp_path / "tracks.npz").write_bytes(b"PK")
+    for path in (tmp_path, tmp_path / "tracks.npz"):
+        with pytest.raises(RecordingError, match=r"'jiggle-mj import .* --out run\.mcap'"):
+            Recording.open(path)
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
