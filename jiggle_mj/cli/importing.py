@@ -1,6 +1,7 @@
 """The verbs `import` and `inspect`: a robot's bag or a folder of measured points becomes a recording."""
 
 import json
+import re
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -116,7 +117,7 @@ def inspect(
     for each in report.topics:
         begin, end = ("-", "-") if each.span is None else (f"{time:.3f}" for time in each.span)
         rate = "-" if each.rate is None else f"{each.rate:.4g}"
-        shown = each.type.rpartition("/")[2] + ("" if each.stamped is not False else " (no stamp)")
+        shown = re.split("[/.]", each.type)[-1] + ("" if each.stamped is not False else " (no stamp)")
         table.add_row(
             each.name, shown, str(each.count), rate, begin, end, each.role or "-", ", ".join(each.frames) or "-"
         )
