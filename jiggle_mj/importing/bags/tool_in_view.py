@@ -25,8 +25,8 @@ MARGIN = 1.0
 """How far beyond the image's border a tip may be without a word [image sizes]: jaws may hold an edge out of view."""
 SCENE_FACTOR = 2.0
 """How much further or nearer than the scene a tip may be: what the jaws hold is near what has features."""
-OTHER_UNITS = ("cm", "mm")
-"""Units in which robots report beside metres."""
+REPORTED_UNITS = ("m", "cm", "mm")
+"""Units in which robots report."""
 MIN_PULL_M = DEFAULT_GRASP_RADIUS
 """Extent of the tip's path in a grasp up to which another unit is none [m]: a pull is longer than the grip is wide."""
 OPTICAL_IN_BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -71,7 +71,8 @@ def tool_in_view(camera: StereoCamera, prepared: Preparation, scene: tuple[float
         cure = f"It is in view {readings}."
     else:
         left, tool = prepared.topic("left"), prepared.topic("tool")
-        cure = f"Is the frame of {left} an optical one (x right, y down, z forward), and {tool} in metres?"
+        unit = next(name for name, factor in LENGTH_UNITS.items() if factor == prepared.settings.tool_unit)
+        cure = f"Is the frame of {left} an optical one (x right, y down, z forward), and {tool} in {unit}?"
     if behind or (readings and not near):
         raise RecordingError(f"{text}. {cure}")
     return [f"WARNING: {text}. {cure}"]
@@ -79,8 +80,11 @@ def tool_in_view(camera: StereoCamera, prepared: Preparation, scene: tuple[float
 
 def _other_readings(camera: StereoCamera, prepared: Preparation, scene: tuple[float, float] | None) -> Iterator[str]:
     """Yield what would put the tip into the scene, each with its cure."""
-    for unit in OTHER_UNITS:
-        tips, pull = _tips(prepared, prepared.tool.scaled(LENGTH_UNITS[unit]))
+    given = prepared.settings.tool_unit
+    for unit in REPORTED_UNITS:
+        if LENGTH_UNITS[unit] == given:
+            continue
+        tips, pull = _tips(prepared, prepared.tool.scaled(LENGTH_UNITS[unit] / given))
         if pull > MIN_PULL_M and _in_scene(camera, tips, scene).all():
             yield f'if its poses are in {unit}: give [tool] unit = "{unit}" in map.toml (--topics)'
     tips, _ = _tips(prepared, prepared.tool)

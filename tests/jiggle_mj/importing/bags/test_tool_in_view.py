@@ -49,6 +49,28 @@ def test_a_tip_in_another_unit_is_named_and_read_with_it(tmp_path: Path, unit: s
     np.testing.assert_allclose(next(iter(recording)).tool.position, [0.02, 0, 0.001], rtol=1e-12)
 
 
+@pytest.mark.parametrize(("stated", "true"), [("mm", "m"), ("cm", "m"), ("m", "cm"), ("mm", "cm"), ("cm", "mm")])
+def test_another_unit_is_tried_instead_of_the_one_that_map_toml_states(tmp_path: Path, stated: str, true: str):
+    """In a base 0.3 m beside the view and 0.2 m above, behind the camera: the tip is back at the world's origin."""
+    metres = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+    away = np.eye(4)
+    away[:3, 3] = 0.3, 0.1, 0.2
+
+    def tool(made: RobotBag) -> None:
+        made.tf("/tf_static", 0, made.transform("world", "base", None, away))
+        for index in range(4):
+            tip = np.array([-0.3, 0.001 * index - 0.1, -0.199]) / metres[true]
+            made.pose("/tool/pose", index * STEP, tip, header=made.header(index * STEP, "base"))
+            made.write("/gripper/closed", index * STEP, "std_msgs/Bool", data=True)
+
+    path = bag(tmp_path, cameras, write_images, tool)
+    why = refused(path, tool_unit=metres[stated])
+    assert f'It is in view if its poses are in {true}: give [tool] unit = "{true}"' in why
+    assert why.count("its poses are in") == 1
+    _, recording = imported(path, tool_unit=metres[true])
+    np.testing.assert_allclose(next(iter(recording)).tool.position, [0, 0, 0.001], atol=1e-15)
+
+
 READINGS = {
     "as the pose of the world in the camera": np.linalg.inv,
     "as OpenGL's": lambda T: T @ np.diag([1.0, -1.0, -1.0, 1.0]),
