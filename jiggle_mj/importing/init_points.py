@@ -16,7 +16,8 @@ from .points.dic_formats import DIC_FORMATS
 from .points.file_kinds import file_kind
 from .points.measured import is_planar
 from .points.points_table import PointFiles
-from .points.visibility import as_visibility, may_say_visibility
+from .points.rating_names import rates_points
+from .points.visibility import as_visibility
 from .units import LENGTH_UNITS, LIKELY_EXTENT, PIXELS_ARE_NO_LENGTH, PREFERRED_UNITS
 
 ARCHIVES, FRAMES = (".npz", ".mat"), (".csv", ".txt", ".tsv", ".xyz", ".dat", ".ply", ".obj", ".pcd", ".asc", ".pts")
@@ -144,7 +145,7 @@ def _first_readable(folder: Path, files: PointFiles, failures: list[str]) -> Gue
     ways: list[tuple[PointFiles, str | None]] = [(files, None)]
     if files.key is None:
         ways += [(replace(files, format=name), None) for name in DIC_FORMATS]
-    visible = [as_visibility(key) for key in shapes if key != files.key and may_say_visibility(key)]
+    visible = [as_visibility(key) for key in shapes if key != files.key and rates_points(key)]
     ways += [(replace(files, layout=("points", "frames", "xyz")), "points, frames")] if shapes else []
     ways += [(replace(way, visibility=each), layout) for each in visible for way, layout in ways]
     for way, layout in ways:

@@ -13,12 +13,13 @@ from .headings import plain_heading, stated_units
 from .measured import Measured
 from .missing_rule import AXES, MissingRule
 from .points_table import NONE, PointFiles
+from .rating_names import marks_hidden, rates_points
 from .row_keys import Column, RowKeys
 from .text_format import TextFormat, column_numbers
 from .text_lines import read_lines
 from .text_table import TextTable
 from .tracks import FrameRows, joined_tracks
-from .visibility import HIDDEN_NAME, may_say_visibility, refuse_low_ratings
+from .visibility import refuse_low_ratings
 
 
 def read_text_frames(paths: list[Path], points: PointFiles) -> Measured:
@@ -51,7 +52,7 @@ def read_text_frames(paths: list[Path], points: PointFiles) -> Measured:
     finite = np.asarray(np.isfinite(values[:, :, :n]).all(axis=2))
     for number, column in enumerate(ratings, start=len(wanted)):
         name = first.sample.names[column]
-        suggested = f"{name} {'>=' if HIDDEN_NAME.search(name) else '<'} 0.5"
+        suggested = f"{name} {'>=' if marks_hidden(name) else '<'} 0.5"
         refuse_low_ratings(
             values[:, :, number],
             finite,
@@ -132,7 +133,7 @@ def _rating_columns(table: TextTable, keys: RowKeys, used: list[Column]) -> list
     """Return the columns of numbers whose headings may say which points are seen, and which nothing uses."""
     sample = table.sample
     taken = {*keys.columns, *column_numbers(sample, used, str(table.text.path))}
-    likely = [number for number, name in enumerate(sample.names) if number not in taken and may_say_visibility(name)]
+    likely = [number for number, name in enumerate(sample.names) if number not in taken and rates_points(name)]
     readable = sample.format.readable
     return [number for number in likely if all(readable(row[number]) for row in sample.rows if len(row) > number)]
 

@@ -135,6 +135,9 @@ PERCENT = np.where(lost(), 20.0, 95.0)
         ("is_outlier", lost().astype(float), 'visibility = "not is_outlier"'),
         ("missing_flag", lost(), 'visibility = "not missing_flag"'),
         ("not_occluded", ~lost(), 'visibility = "not_occluded"'),
+        ("ptsVisible", ~lost(), 'visibility = "ptsVisible"'),
+        ("occlusion_prob", np.where(lost(), 0.9, 0.1), 'visibility = "not occlusion_prob"'),
+        ("outlierScore", 100 - PERCENT, 'missing = "outlierScore > NUMBER"'),
     ],
 )
 def test_a_rating_that_nobody_names_is_refused_and_its_cure_works(tmp_path, name, values, cure):
@@ -170,6 +173,28 @@ def test_a_rating_that_tells_nothing_new_needs_no_key(tmp_path):
     (where / "run.mcap").unlink()
     (where / "run.truth.mcap").unlink()
     assert bring_in(where)[0].notes == ("score (3, 4) has no value for each frame and point, and is not used",)
+
+
+@pytest.mark.parametrize("name", ["problem", "division", "failure_load", "mask_area", "viscosity", "reconfigured"])
+def test_an_array_whose_name_holds_such_a_word_by_chance_rates_nothing(tmp_path, name):
+    where = archive(tmp_path, 'key = "p"', **{name: PERCENT})
+    (note,) = bring_in(where)[0].notes
+    assert note.startswith(f"{name} (3, 12): one value for each frame and point, not used")
+
+
+def test_ratings_of_another_name_are_noted_and_the_cure_works(tmp_path):
+    (tmp_path / "asked").mkdir()
+    where = archive(
+        tmp_path / "asked", 'key = "p"', zncc=np.where(lost(), 0.1, 0.9), sigma=PERCENT.T, same=np.ones(SHAPE)
+    )
+    (note,) = bring_in(where)[0].notes
+    assert note.startswith("zncc (3, 12), sigma (12, 3): one value") and 'visibility = "zncc"' in note
+    same(read(archive(tmp_path, 'key = "p"\nvisibility = "zncc"', zncc=np.where(lost(), 0.1, 0.9))), lost())
+
+
+def test_large_ratings_of_lost_points_named_as_visibility_get_the_right_sign(tmp_path):
+    with pytest.raises(RecordingError, match='give missing = "ARRAY > NUMBER"'):
+        read(archive(tmp_path, 'key = "p"\nvisibility = "not occluded"', occluded=PERCENT))
 
 
 def test_a_visibility_named_as_its_opposite_is_refused(tmp_path):
