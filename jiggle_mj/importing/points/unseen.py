@@ -77,12 +77,14 @@ class MarkCheck:
         self._refuse_where(positions, np.asarray(jumped | at_origin), "it is elsewhere in other frames")
         alone = always & isolated(positions[0], spacing(positions[0]))
         self._refuse_where(positions, marked & alone, "it is there in every frame, far from all others")
-        identity = PointIdentity(positions[0], spacing(positions[0]))
-        for frame in positions:
+        # As if the sheet were some metres large: its unit is not known here, and rounding grows with the numbers.
+        metres = positions / (_extent(positions) or 1.0)
+        identity = PointIdentity(metres[0], spacing(metres[0]))
+        for frame in metres:
             identity.add(frame)
         if identity.shared_place is not None:
             place, count = identity.shared_place
-            there = np.asarray((np.abs(positions - place) <= SAME_PLACE_M).all(axis=2))
+            there = np.asarray((np.abs(metres - place) <= SAME_PLACE_M).all(axis=2))
             self._refuse_where(positions, there, f"{count} points jump to it at different times")
 
     def doubted_rows(self, positions: Float[np.ndarray, "t n 3"]) -> list[str]:

@@ -37,6 +37,18 @@ def test_one_lost_point_a_frame_at_a_place_inside_the_sheet_is_refused(tmp_path,
         notes(tmp_path, positions)
 
 
+@pytest.mark.parametrize("mark", [4e7, 4e7 + 0.4])
+def test_a_place_of_lost_points_is_found_in_micrometres_far_from_the_origin(tmp_path, mark):
+    """Numbers of 4e7 are rounded to 7e-9, which is more than a place in metres is."""
+    positions = 1e3 * sheet() + 4e7
+    for k in range(1, FRAMES):
+        positions[k, 5 * k % 48] = mark
+    where = folder(tmp_path, toml=TOML_OF_ARRAY.replace('unit = "mm"', 'unit = "um"'))
+    np.savez(where / "d.npz", p=positions)
+    with pytest.raises(RecordingError, match=r"11 points jump to it at different times.*give missing = \["):
+        bring_in(where)
+
+
 @pytest.mark.parametrize("mark", [0, -1, -999])
 def test_a_row_that_is_at_a_mark_far_from_the_sheet_in_every_frame_is_refused(tmp_path, mark):
     positions = sheet() + 300
