@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from .clock import LIKELY_PERIOD, MAX_PERIOD
-from .init_points import UNIT_SUFFIX, GuessedPoints
+from .init_points import GuessedPoints
 from .points.archives import read_array
+from .points.headings import stated_unit
 from .reports import MAX_AGE, MAX_OUTSIDE
 from .units import LENGTH_UNITS, TIME_UNITS
 
@@ -94,7 +95,7 @@ def guess_arrays(folder: Path, points: GuessedPoints) -> GuessedArrays:
         stated = TIME_SUFFIX.search(tool_times)
         tool_time_unit = time_unit if stated is None else stated[1]
         apart = _apart(frame_times, TIME_UNITS[time_unit], report_times, TIME_UNITS[tool_time_unit])
-    suffix = None if tool is None else UNIT_SUFFIX.search(tool)
+    tool_unit = None if tool is None else stated_unit(tool)
     return GuessedArrays(
         times=times,
         time_unit=time_unit,
@@ -107,7 +108,7 @@ def guess_arrays(folder: Path, points: GuessedPoints) -> GuessedArrays:
         tool_turns=tool_turns,
         tool_time_unit=None if tool_time_unit == time_unit else tool_time_unit,
         clocks_apart=apart,
-        tool_unit=None if suffix is None or suffix[1] not in LENGTH_UNITS else suffix[1],
+        tool_unit=tool_unit if tool_unit in LENGTH_UNITS else None,
     )
 
 

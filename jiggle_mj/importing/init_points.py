@@ -24,8 +24,6 @@ ARCHIVES, FRAMES = (".npz", ".mat"), (".csv", ".txt", ".tsv", ".xyz", ".dat", ".
 """Endings of files that hold all frames, and of files that hold one each."""
 MAX_FILES = 20_000
 """Files of a folder that are looked at."""
-UNIT_SUFFIX = re.compile(r"_(um|mm|cm|m)$")
-"""End of an array's name that states its unit of length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,10 +74,8 @@ def guess_points(folder: Path) -> GuessedPoints:
 def guess_unit(points: GuessedPoints) -> tuple[str, str]:
     """Return the unit of the data, and why: the name of the array states it, or the extent of the sheet fits it."""
     key = points.files.key
-    suffix = UNIT_SUFFIX.search(key) if isinstance(key, str) else None
-    stated = points.units | ({suffix[1]} if suffix else set())
     extent = float(np.nanmax(np.ptp(_finite(points.positions[0]), axis=0)))
-    for unit in sorted(stated & LENGTH_UNITS.keys()):
+    for unit in sorted(points.units & LENGTH_UNITS.keys()):
         name = "headings say" if key is None else f"name {key} says"
         return unit, f"as the {name}; the sheet is {extent * LENGTH_UNITS[unit]:.3g} m large"
     low, high = LIKELY_EXTENT

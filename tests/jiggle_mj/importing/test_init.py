@@ -60,6 +60,17 @@ def test_an_archive_with_units_a_tool_and_triangles_is_described(tmp_path):
     assert description.problem is None
 
 
+@pytest.mark.parametrize(
+    ("key", "per_mm", "unit", "why"),
+    [("points_m", 1.0, "mm", "guessed"), ("points_m", 1e-3, "m", "guessed"), ("points_mm", 1.0, "mm", "as the name")],
+)
+def test_a_name_that_ends_in_m_states_no_unit(tmp_path, key, per_mm, unit, why):
+    """It may mean marker, mean or measured: the extent of the sheet decides."""
+    np.savez(tmp_path / "d.npz", **{key: per_mm * frames()})
+    description = describe_folder(tmp_path)
+    assert description.problem is None and f'unit = "{unit}"  # {why}' in description.text
+
+
 def test_an_array_of_lost_points_is_taken_as_its_opposite(tmp_path):
     outlier = np.zeros((12, 64), np.uint8)
     outlier[3:5, 40] = 1
