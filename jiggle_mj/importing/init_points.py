@@ -1,5 +1,6 @@
 """Guess which files of a folder hold the tracked points, and how they are read."""
 
+import json
 import re
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -14,9 +15,13 @@ from .point_files import read_frames
 from .points.archives import array_shapes
 from .points.dic_formats import DIC_FORMATS
 from .points.file_kinds import file_kind
+from .points.headings import plain_heading, track_column
 from .points.measured import is_planar
+from .points.missing_rule import AXES
 from .points.points_table import PointFiles
 from .points.rating_names import rates_points
+from .points.text_lines import read_lines
+from .points.text_table import TextTable
 from .points.visibility import as_visibility
 from .units import LENGTH_UNITS, LIKELY_EXTENT, PIXELS_ARE_NO_LENGTH, PREFERRED_UNITS
 
@@ -148,7 +153,7 @@ def _first_readable(folder: Path, files: PointFiles, failures: list[str]) -> Gue
         try:
             found = read_frames(DataFolder(path=folder), way)
         except RecordingError as failure:
-            failures.append(str(failure))
+            failures += [str(failure)] * (way.format is None)  # where a format is right, the first reading names it
             continue
         if found.time_heading is not None and way.times is None:
             try:
@@ -166,4 +171,36 @@ def _first_readable(folder: Path, files: PointFiles, failures: list[str]) -> Gue
                 notes=found.notes,
                 layout=layout,
             )
+        if len(found.positions) == 1 and way.format is None and len(found.names) == 1:
+            failures.append(_why_one_frame(folder / found.names[0]))
     return None
+
+
+def _why_one_frame(path: Path) -> str:
+    """Return what to do about a file that is read as one frame: columns that repeat may number frames and points."""
+    why = f"{path} is one frame, and two are needed: give one file a frame"
+    if not path.is_file() or file_kind(path) != "text":
+        return f"{why}."
+    table = TextTable.open(read_lines(path), columns=None, given=(None, None), known=None)
+    names = table.sample.names or range(table.width)
+    repeated = [column for column in range(table.width) if _repeats(table, column)]
+    track = track_column(table.sample.names)
+    repeated.sort(key=lambda column: column == track)
+    given = [json.dumps(names[column], ensure_ascii=False) for column in repeated]
+    if not given:
+        return f"{why}, or frame_column in [points] for the column that numbers the frames."
+    second = given[1] if len(given) > 1 else '"COLUMN"'
+    others = f" ({quoted(', '.join(given))} repeat)" if len(given) > 2 else ""
+    places = "" if table.sample.names else ", and columns = [...] for x, y and z"
+    return (
+        f"{why}, or in [points] the column that numbers the frames and the one that names the points, as frame_column "
+        f"= {given[0]} and track_column = {second}{others}{places}."
+    )
+
+
+def _repeats(table: TextTable, column: int) -> bool:
+    """Return whether the column is headed as no coordinate, and has each value twice or more on average."""
+    if table.sample.names and plain_heading(table.sample.names[column]) in AXES:
+        return False
+    cells = table.names_of(column)
+    return 1 < len(set(cells)) <= len(cells) / 2

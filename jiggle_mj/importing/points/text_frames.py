@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from ...errors import RecordingError
 from ..data_folder import quoted
@@ -13,6 +12,7 @@ from .headings import plain_heading, stated_units
 from .measured import Measured
 from .missing_rule import AXES, MissingRule
 from .points_table import NONE, PointFiles
+from .position_columns import guessed_columns, refuse_row_numbers
 from .rating_names import marks_hidden, rates_points
 from .row_keys import Column, RowKeys
 from .text_format import TextFormat, column_numbers
@@ -48,7 +48,7 @@ def read_text_frames(paths: list[Path], points: PointFiles) -> Measured:
     values, matched = joined_tracks(frames, keys.track_name)
     n = len(columns)
     if points.columns is None and points.format is None:
-        _refuse_row_numbers(values[0, :, 0], first)
+        refuse_row_numbers(values[0, :, 0], first)
     finite = np.asarray(np.isfinite(values[:, :, :n]).all(axis=2))
     for number, column in enumerate(ratings, start=len(wanted)):
         name = first.sample.names[column]
@@ -114,19 +114,8 @@ def _position_columns(table: TextTable, points: PointFiles, keys: RowKeys) -> tu
         return list(DIC_FORMATS[points.format].columns), []
     if points.columns is not None:
         return list(points.columns), []
-    columns = column_numbers(table.sample, None, str(table.text.path))
-    plain = [plain_heading(name) for name in table.sample.names]
-    if plain and [plain[column] for column in columns] == list(AXES):
-        return [*columns], [] if columns == [0, 1, 2] else [f"x, y and z are columns {columns}, by the heading"]
-    for name, known in DIC_FORMATS.items():
-        if {plain_heading(column) for column in known.columns} <= set(plain):
-            raise RecordingError(f'{table.text.path} has the headings of a DIC export: give format = "{name}".')
-    if keys.columns & {0, 1, 2}:
-        raise RecordingError(
-            f"{table.text.path} has the heading '{quoted(', '.join(table.sample.names))}', which names no x, y and z: "
-            "give columns in [points]."
-        )
-    return [0, 1, 2], []
+    columns, notes = guessed_columns(table, keys)
+    return [*columns], notes
 
 
 def _rating_columns(table: TextTable, keys: RowKeys, used: list[Column]) -> list[int]:
@@ -174,13 +163,3 @@ def _unused_displacements(table: TextTable, columns: list[Column]) -> tuple[str,
         if all(plain.count(name) == 1 for name in wanted):
             return tuple(table.sample.names[plain.index(name)] for name in wanted)
     return tuple(names[0] for names in named) if all(len(names) == 1 for names in named) else ()
-
-
-def _refuse_row_numbers(first_column: Float[np.ndarray, " n"], table: TextTable) -> None:
-    """Refuse a first column that counts the rows, where there are more than three and the user named none."""
-    count = np.arange(len(first_column))
-    if table.width > 3 and len(count) > 2 and np.array_equal(first_column - first_column[0], count):
-        raise RecordingError(
-            f"{table.text.path}: the first of {table.width} columns counts the rows, and would be x: give columns = "
-            "[1, 2, 3] in [points], or those of x, y and z."
-        )

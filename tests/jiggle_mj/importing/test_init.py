@@ -71,6 +71,43 @@ def test_a_name_that_ends_in_m_states_no_unit(tmp_path, key, per_mm, unit, why):
     assert description.problem is None and f'unit = "{unit}"  # {why}' in description.text
 
 
+def comma(value: float) -> str:
+    return f"{value:.4f}".replace(".", ",")
+
+
+def point(value: float) -> str:
+    return f"{value:.4f}"
+
+
+@pytest.mark.parametrize(
+    ("heading", "form", "number", "cure"),
+    [
+        ("Bild;Punkt;x;y;z", "{t};{i};{x};{y};{z}", comma, 'frame_column = "Bild" and track_column = "Punkt".'),
+        ("id,cuadro,x,y,z", "{i},{t},{x},{y},{z}", point, 'frame_column = "cuadro" and track_column = "id".'),
+        ("", "{t} {i} {x} {y} {z}", point, "frame_column = 0 and track_column = 1, and columns = "),
+        ("Bild;X-Achse;Y-Achse;Z-Achse", "{t};{x};{y};{z}", comma, 'columns = ["X-Achse", "Y-Achse", "Z-Achse"]'),
+        (
+            "frame,id,x,y",
+            "{t},{i},{x},{y}",
+            point,
+            'two coordinates, and no z: .* columns = ["x", "y"] .*pixels are no',
+        ),
+        ("Nr;X_px;Y_px", "{i};{x};{y}", comma, 'two coordinates, and no z: .* columns = ["X_px", "Y_px"]'),
+        ("a b", "{x} {y}", point, "two coordinates, and no z: .* columns = [0, 1]"),
+    ],
+)
+def test_a_table_that_needs_keys_is_refused_with_them(tmp_path, heading, form, number, cure):
+    table = [
+        form.format(t=t, i=i, x=number(x), y=number(y), z=number(z))
+        for t, each in enumerate(frames()[:3])
+        for i, (x, y, z) in enumerate(each)
+    ]
+    (tmp_path / "all.csv").write_text("\n".join([heading, *table]))
+    with pytest.raises(RecordingError, match=cure.replace("[", r"\[")) as failure:
+        describe_folder(tmp_path)
+    assert "MODEL_COORDINATES" not in str(failure.value)
+
+
 def test_an_array_of_lost_points_is_taken_as_its_opposite(tmp_path):
     outlier = np.zeros((12, 64), np.uint8)
     outlier[3:5, 40] = 1
