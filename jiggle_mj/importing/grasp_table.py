@@ -26,6 +26,8 @@ TOOL_KEYS = ("tool", "tool_times", "tool_turns", "tool_unit", "tool_time_unit", 
 """Keys of the one tool; several `[[grasp]]` may repeat them."""
 PATH_KEYS = ("start", "direction", "step")
 """Keys of a straight pull."""
+HELD_KEYS = ("rows", "rows_file", "rows_first", "at")
+"""Keys that say which points are held."""
 WHEN_KEYS = ("run", "begin", "end", "frames")
 """Keys that say which part of the recording a grasp covers."""
 
@@ -173,6 +175,12 @@ def _path(table: StrictTable) -> GraspTable:
         step=table.take("step", kinds.number),
     )
     radius = table.take("radius", kinds.positive, DEFAULT_GRASP_RADIUS)
+    other = next((key for key in (*HELD_KEYS, *WHEN_KEYS, *TOOL_KEYS, "after") if key in table.values), None)
+    if other is not None:
+        raise RecordingError(
+            f"{table.where} has both start, of a straight pull, and {other}, of held points or a tool that reported; "
+            "give one of both."
+        )
     table.refuse_unknown()
     return GraspTable(grasps=(), path=path, tool=None, path_radius=radius)
 

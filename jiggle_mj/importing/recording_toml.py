@@ -155,7 +155,7 @@ def _recording(top: StrictTable) -> MeasuredRecording:
         source=top.take("source", kinds.text, ""),
         unit=unit,
         unit_name=top.values["unit"],
-        period=_period(top) if points.times is None else None,
+        period=None if points.times is not None and "period" not in top.values else _period(top),
         time_unit=unit_of(top, "time_unit", TIME_UNITS) if "time_unit" in top.values else None,
         noise_sd=top.take("noise_sd", kinds.positive),
         points=points,
@@ -177,11 +177,15 @@ def _recording(top: StrictTable) -> MeasuredRecording:
 
 def _refuse_contradictions(recording: MeasuredRecording, where: str) -> None:
     tool = recording.grasp.tool
+    if recording.points.times is not None and recording.period is not None:
+        raise RecordingError(
+            f"{where} has both period and [points] times; the times say when the frames are: give one."
+        )
     if isinstance(recording.attached, float) and recording.extension is None:
         raise RecordingError(f"{where} [truth] attached_beyond needs [mesh.extend], whose axis gives its direction.")
     if recording.extension is not None and recording.margin is not None:
         raise RecordingError(f"{where} has both [mesh.extend] and [mesh] margin or outline; give one.")
-    if recording.points.times is None and recording.time_unit is not None:
+    if recording.period is not None and recording.time_unit is not None:
         raise RecordingError(f"{where} time_unit is that of [points] times, which is missing; period is in seconds.")
     if tool is not None and tool.times is not None and recording.points.times is None:
         raise RecordingError(

@@ -47,6 +47,12 @@ from tests.support.measured_folder import TOML, bring_in, folder
         ('files = ["rest.xyz", "pulled_*.xyz"]', 'key = "p"\nfiles = ["a.xyz"]', "key names the array of an .npz"),
         ('files = ["rest.xyz", "pulled_*.xyz"]', 'files = ["none_*.xyz"]', "no file that matches 'none_"),
         ('files = ["rest.xyz", "pulled_*.xyz"]', 'files = ["no.xyz"]', r"no\.xyz cannot be read: No such file"),
+        ('_*.xyz"]', '_*.xyz"]\ntimes = "t"', r"has both period and \[points\] times; .*: give one"),
+        (
+            "rows = [0, 1]",
+            "rows = [0]\nstart = [0, 0, 0]\ndirection = [0, 0, 1]\nstep = 1e-3",
+            r"\[grasp\] has both start, of a straight pull, and rows",
+        ),
         ('_*.xyz"]', '_*.xyz"]\nrest = 3', r"\[points\] rest is 3; there are 3 frames"),
         ('_*.xyz"]', '_*.xyz"]\n[frame]\nrotation = [[2,0,0],[0,1,0],[0,0,1]]', "is not a rotation"),
         ('_*.xyz"]', '_*.xyz"]\n[mesh.extend]\naxis = [0,0,0]', "axis must be a vector that is not zero"),
