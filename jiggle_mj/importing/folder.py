@@ -24,6 +24,7 @@ from .complete_files import complete_files
 from .data_folder import DataFolder
 from .declared_mesh import declared_mesh
 from .known_attachments import measured_truth
+from .length_checks import refuse_large_lengths
 from .point_files import read_frames
 from .points.archives import read_array
 from .points.headings import PIXELS
@@ -100,6 +101,7 @@ def import_folder(
     _refuse_unit(found, given)
     frames, names, steps = _frames_in_world(found, given)
     rest = frames[0]
+    refuse_large_lengths(given, rest, steps)
     clock = _clock(data, given, found)
     mesh = declared_mesh(data, given, rest, found.notes)
     vertices = None if mesh is None else mesh.vertices
