@@ -31,11 +31,11 @@ def guess_held(frames: Float[np.ndarray, "t n 3"]) -> Int[np.ndarray, " h"]:
     at = int(np.argmax(leading >= FIRST_SHARE * leading.max())) if leading.max() > 0 else len(frames) - 1
     moved_then = np.nan_to_num(moved[at])
     level = HELD_SHARE * np.sort(moved_then)[-min(N_LEADERS, len(moved_then)) :].mean()
-    order = np.argsort(-moved_then, kind="stable")[:MOST_HELD]
-    candidates = order[moved_then[order] >= level]
+    order = np.argsort(-moved_then, kind="stable")
     seen = np.flatnonzero(np.isfinite(frames[0]).all(axis=1))
+    candidates = order[(moved_then[order] >= level) & np.isin(order, seen)][:MOST_HELD]
     spacing = float(np.median(KDTree(frames[0][seen]).query(frames[0][seen], k=2)[0][:, 1]))
-    centre = np.nanmedian(frames[0][candidates], axis=0)
+    centre = np.median(frames[0][candidates], axis=0)
     near = np.linalg.norm(frames[0][candidates] - centre, axis=1) <= spacing * np.sqrt(MOST_HELD)
     return np.sort(candidates[near] if near.any() else candidates[:1])
 
@@ -52,7 +52,7 @@ def guess_noise(frames: Float[np.ndarray, "t n 3"]) -> float:
     estimates = [_rough(frames[:, :, axes])]
     if len(frames) >= 3:
         bend = frames[:-2, :, axes] - 2 * frames[1:-1, :, axes] + frames[2:, :, axes]
-        estimates.append(MAD_TO_SD * float(np.nanmedian(np.abs(bend))) / np.sqrt(6))
+        estimates.append(MAD_TO_SD * _median(np.abs(bend)) / np.sqrt(6))
     finite = [estimate for estimate in estimates if np.isfinite(estimate)]
     return max([MIN_NOISE_SHARE * extent, min(finite, default=0.0)])
 
@@ -64,4 +64,10 @@ def _rough(frames: Float[np.ndarray, "t n c"]) -> float:
     moved = (frames - frames[0])[1:, seen]
     stray = moved - moved[:, near].mean(axis=2)
     # A displacement holds the noise of two frames, and the neighbours' mean adds a k-th.
-    return MAD_TO_SD * float(np.nanmedian(np.abs(stray))) / np.sqrt(2 * (1 + 1 / k))
+    return MAD_TO_SD * _median(np.abs(stray)) / np.sqrt(2 * (1 + 1 / k))
+
+
+def _median(values: Float[np.ndarray, "..."]) -> float:
+    """Return the median of the values that are known; NaN where none is."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else np.nan

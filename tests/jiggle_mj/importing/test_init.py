@@ -71,6 +71,22 @@ def test_a_name_that_ends_in_m_states_no_unit(tmp_path, key, per_mm, unit, why):
     assert description.problem is None and f'unit = "{unit}"  # {why}' in description.text
 
 
+def test_points_of_which_few_are_seen_together_are_described_without_a_warning(tmp_path):
+    """No point has all its neighbours in any later frame, and those that move most are unseen at rest."""
+    points = frames()
+    points[:, ::2] = np.nan
+    points[0] = frames()[0]
+    points[0, [1, 9]] = np.nan
+    np.savez(tmp_path / "d.npz", p=points)
+    given = tomllib.loads(describe_folder(tmp_path).text)
+    assert not {1, 9} & set(given["grasp"]["rows"])
+    still = np.repeat(frames()[:1], 12, axis=0)
+    still[:, :13] = np.nan
+    (tmp_path / "still").mkdir()
+    np.savez(tmp_path / "still" / "d.npz", p=still)
+    assert min(tomllib.loads(describe_folder(tmp_path / "still").text)["grasp"]["rows"]) == 13
+
+
 def comma(value: float) -> str:
     return f"{value:.4f}".replace(".", ",")
 
