@@ -15,6 +15,10 @@ from jaxtyping import Float
 from ..argument_checks import as_path
 from ..errors import RecordingError
 from ..observation import MeasuredPoints, Observation
+from ..plausibility.identity import PointIdentity
+from ..plausibility.increments import SummedMotion
+from ..plausibility.point_motion import spacing
+from ..plausibility.point_problems import point_problems
 from ..recording.declaration import identity
 from ..recording.mcap_files import truth_path
 from ..recording.truth import write_truth
@@ -102,6 +106,7 @@ def import_folder(
     frames, names, steps = _frames_in_world(found, given)
     rest = frames[0]
     refuse_large_lengths(given, rest, steps)
+    _refuse_mixed_rows(frames)
     clock = _clock(data, given, found)
     mesh = declared_mesh(data, given, rest, found.notes)
     vertices = None if mesh is None else mesh.vertices
@@ -195,6 +200,16 @@ def _refuse_extent(rest: Float[np.ndarray, "n 3"], given: MeasuredRecording, *, 
         f'the sheet is {extent:.3g} m large in unit = "{given.unit_name}"; {MIN_EXTENT:g} to {MAX_EXTENT:g} m is '
         f"expected: {cure}{f'; {PIXELS_ARE_NO_LENGTH}.' if planar else ''}"
     )
+
+
+def _refuse_mixed_rows(frames: Float[np.ndarray, "t n 3"]) -> None:
+    """Refuse rows that are other points in other frames, before their motion is taken for that of points."""
+    identity_of_rows = PointIdentity(frames[0], spacing(frames[0]))
+    for frame in frames:
+        identity_of_rows.add(frame)
+    for problem in point_problems(identity_of_rows, SummedMotion()):
+        if problem.name == "identities" and problem.refuses:
+            raise RecordingError(problem.text)
 
 
 def _clock(folder: DataFolder, given: MeasuredRecording, found: PointFrames) -> FrameClock:

@@ -90,3 +90,15 @@ def test_displacements_from_frame_to_frame_are_refused_as_such(tmp_path):
     np.savez(where / "d.npz", p=np.repeat(positions[:1], FRAMES, axis=0), u=steps, t=tool)
     with pytest.raises(RecordingError, match="the sum of their displacements over the frames does"):
         bring_in(where)
+
+
+def test_rows_that_are_other_points_in_each_frame_are_refused_before_the_grasp_is_judged(tmp_path):
+    """Most of a frame's rows change places in the first case, some in the second, as a tracker's mistakes."""
+    rng = np.random.default_rng(2)
+    shuffled = np.stack([frame[rng.permutation(48)] for frame in sheet()])
+    with pytest.raises(RecordingError, match=r"48 points take places of others.*A row, or a track_id, must be"):
+        notes(tmp_path, shuffled)
+    few = sheet()
+    few[6:, 30:40] = few[6:, np.roll(np.arange(30, 40), 1)]
+    (tmp_path / "few").mkdir()
+    assert notes(tmp_path / "few", few) == ()
