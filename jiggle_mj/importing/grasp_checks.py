@@ -133,7 +133,8 @@ def _refuse_still(
         return
     leader, leading = list(leaders.items())[-1]
     far = float(np.linalg.norm(leading, axis=1).max())
-    if follow_in_sum(moved[:, grasp.held].mean(axis=1), leading):
+    throughout = moved[:, grasp.held[np.isfinite(moved[:, grasp.held]).all(axis=(0, 2))]]
+    if throughout.shape[1] and follow_in_sum(throughout.mean(axis=1), leading):
         raise RecordingError(
             f"{grasp.what}: the held points do not follow {leader}, and the sum of their displacements over the frames "
             "does: give displacements from the rest frame, not from the frame before."

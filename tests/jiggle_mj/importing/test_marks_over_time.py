@@ -79,12 +79,15 @@ def test_displacements_without_coordinates_are_refused_as_such(tmp_path, first):
         notes(tmp_path, displacements)
 
 
-def test_displacements_from_frame_to_frame_are_refused_as_such(tmp_path):
-    """The tool rises by 20 mm in eleven steps; a held point by one step at most."""
+@pytest.mark.parametrize("lost", [None, HELD[0]])
+def test_displacements_from_frame_to_frame_are_refused_as_such(tmp_path, lost):
+    """The tool rises by 20 mm in eleven steps; a held point by one step at most, and one may be lost for a while."""
     positions, rise = sheet(), np.linspace(0, 20, FRAMES)
     tool = positions[0, list(HELD)].mean(axis=0) + rise[:, None] * np.array([0, 0, 1.0])
     positions[:, list(HELD)] = positions[0, list(HELD)] + (tool - tool[0])[:, None]
     steps = np.diff(positions, axis=0, prepend=positions[:1])
+    if lost is not None:
+        steps[4:6, lost] = np.nan
     toml = TOML_OF_ARRAY.replace("[grasp]", '[grasp]\ntool = "t"')
     where = folder(tmp_path, toml=toml.replace('key = "p"', 'key = "p"\ndisplacements = "u"'))
     np.savez(where / "d.npz", p=np.repeat(positions[:1], FRAMES, axis=0), u=steps, t=tool)
