@@ -153,6 +153,11 @@ def _held(
             nearest = np.linalg.norm(vertices - centre, axis=1).min()
             if table.held.at is None and nearest <= table.radius:
                 return np.empty(0, int)
+        if not np.isfinite(distance).any():
+            raise RecordingError(
+                f"{table.where} holds nothing: {names[closing]}, in which the jaws close, shows no point; choose "
+                "another after, or other frames."
+            )
         if not len(held):
             raise RecordingError(
                 f"{table.where} holds nothing: in {names[closing]} no point lies within the radius of "

@@ -150,6 +150,16 @@ def test_the_unit_in_which_the_tool_stays_at_its_points_is_the_cure(tmp_path, pe
         bring_in(where)
 
 
+def test_jaws_that_close_on_no_seen_point_are_refused(tmp_path):
+    where = two_pulls(tmp_path, TWO_PULLS.format(first="", second="at = [0.045, 0.045, 0.0]\nradius = 8e-3"))
+    with np.load(where / "d.npz") as arrays:
+        points = arrays["p"].copy()
+        points[4] = np.nan
+        np.savez(where / "d.npz", **(dict(arrays) | {"p": points}))
+    with pytest.raises(RecordingError, match="frame 4, in which the jaws close, shows no point; choose another after"):
+        bring_in(where)
+
+
 def test_a_mirrored_tool_does_not_make_its_points_stand_still(tmp_path):
     """They follow the points that move most; that the tool goes down is for the survey to say."""
     where = two_pulls(tmp_path, TWO_PULLS.format(first=TOOL, second="rows = [28, 29, 34, 35]"))
