@@ -13,6 +13,7 @@ from .data_folder import DataFolder, quoted
 from .points.array_frames import read_array_frames
 from .points.file_kinds import FileKind, file_kind
 from .points.frame_order import frame_files
+from .points.increments import doubt_increments
 from .points.measured import Measured, PointFrames, displaced, in_space
 from .points.mesh_frames import read_mesh_frames
 from .points.points_table import PointFiles
@@ -36,10 +37,13 @@ def read_frames(folder: DataFolder, points: PointFiles) -> PointFrames:
         other = next(path for each, path in kinds.items() if each != kind)
         raise RecordingError(f"{paths[0].name} and {other.name} are files of different kinds; frames need one kind.")
     measured = _read(paths, kind, points)
-    positions = in_space(displaced(measured))
+    given = displaced(measured)
+    positions = in_space(given)
     if measured.positions.shape[2] == 2:
         notes.append("points have two coordinates: they lie in the plane z = 0")
     positions = _without_unseen(positions, measured, points)
+    if given is not measured.positions:
+        notes += doubt_increments(positions)
     return PointFrames(
         positions=positions,
         times=measured.times,

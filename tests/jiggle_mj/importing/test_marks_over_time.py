@@ -105,3 +105,40 @@ def test_rows_that_are_other_points_in_each_frame_are_refused_before_the_grasp_i
     few[6:, 30:40] = few[6:, np.roll(np.arange(30, 40), 1)]
     (tmp_path / "few").mkdir()
     assert notes(tmp_path / "few", few) == ()
+
+
+def of_displacements(tmp_path, positions: np.ndarray, *, steps: bool) -> tuple[str, ...]:
+    """Import the reference and displacements, from rest or from the frame before, without a tool; return the notes."""
+    tmp_path.mkdir(exist_ok=True)
+    moved = np.diff(positions, axis=0, prepend=positions[:1]) if steps else positions - positions[0]
+    reference = np.repeat(positions[:1], len(positions), axis=0)
+    return notes(tmp_path, reference, 'displacements = "u"\nmissing = "none"', u=moved)
+
+
+RISES = {
+    "steady": np.linspace(0, 20, 24),
+    "up and back": 20 - np.abs(np.linspace(-20, 20, 24)),
+    "eased": 20 * np.sin(np.linspace(0, np.pi / 2, 24)) ** 2,
+    "back and forth": 10 * np.sin(2 * np.pi * np.arange(24) / 9),
+    "still": np.zeros(24),
+}
+
+
+@pytest.mark.parametrize("noise", [1e-3, 0.05, 0.2])
+@pytest.mark.parametrize("rise", RISES)
+def test_displacements_from_rest_are_never_doubted(tmp_path, rise, noise):
+    """A sheet of which a corner rises, with noise [mm]; and one that stands still."""
+    assert of_displacements(tmp_path, lifted(RISES[rise], noise), steps=False) == ()
+
+
+@pytest.mark.parametrize(("rise", "noise"), [("steady", 1e-3), ("steady", 0.2), ("up and back", 0.05)])
+def test_displacements_from_frame_to_frame_are_doubted_without_a_tool(tmp_path, rise, noise):
+    (note,) = of_displacements(tmp_path, lifted(RISES[rise], noise), steps=True)
+    assert note.startswith("WARNING: are the displacements those from the frame before?")
+
+
+def lifted(rise: np.ndarray, noise: float) -> np.ndarray:
+    rest = sheet()[0]
+    decay = np.exp(-np.linalg.norm(rest - rest[0], axis=1) / 12)
+    up = rise[:, None, None] * decay[:, None] * np.array([0, 0, 1.0])
+    return rest + up + np.random.default_rng(8).normal(scale=noise, size=up.shape)
