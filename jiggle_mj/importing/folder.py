@@ -16,9 +16,8 @@ from ..argument_checks import as_path
 from ..errors import RecordingError
 from ..observation import MeasuredPoints, Observation
 from ..plausibility.identity import PointIdentity
-from ..plausibility.increments import SummedMotion
 from ..plausibility.point_motion import spacing
-from ..plausibility.point_problems import point_problems
+from ..plausibility.point_problems import identity_problems
 from ..recording.declaration import identity
 from ..recording.mcap_files import truth_path
 from ..recording.truth import write_truth
@@ -207,7 +206,7 @@ def _refuse_mixed_rows(frames: Float[np.ndarray, "t n 3"]) -> None:
     identity_of_rows = PointIdentity(frames[0], spacing(frames[0]))
     for frame in frames:
         identity_of_rows.add(frame)
-    for problem in point_problems(identity_of_rows, SummedMotion()):
+    for problem in identity_problems(identity_of_rows):
         if problem.name == "identities" and problem.refuses:
             raise RecordingError(problem.text)
 

@@ -26,8 +26,8 @@ ISOLATED = 5.0
 """Distance to the nearest other point, above which one is isolated [spacings]: of points that are strewn at random, one
 in thirty million. One that jumps so far from its neighbours is wild: the sheet would be torn."""
 LEAST_LOST = 3
-"""Points that come to one coordinate from which it stands for a lost one: of two wild ones it may be chance where
-coordinates are rounded."""
+"""Frames in which further points come to one coordinate from which it stands for a lost one: of two wild ones it may be
+chance where coordinates are rounded, and what the jaws hold may come to one height in one frame."""
 SAME_PLACE_M = 1e-9
 """Rounding of a place [m]: of the transformation into the world, and finer than any measurement."""
 
@@ -49,7 +49,8 @@ class PointIdentity:
         """Points that are far from all others at rest [m]."""
         self._last: Float[np.ndarray, "n 3"] = np.empty((0, 3))
         self._visitors: defaultdict[Place, set[int]] = defaultdict(set)
-        self._arrivals: defaultdict[tuple[int, float], set[int]] = defaultdict(set)
+        self._arrivals: defaultdict[tuple[int, float], dict[int, int]] = defaultdict(dict)
+        self._frames = 0
         self._jumped: set[int] = set()
         self.wild: dict[int, float] = {}
         """Farthest jump away from its neighbours of each point that makes a wild one [m]."""
@@ -74,16 +75,22 @@ class PointIdentity:
     def lost_coordinate(self) -> tuple[int, float, int] | None:
         """Return the axis whose coordinate most points jump to alone, that value, and their number; None for none.
 
-        At least half of the points that ever jump do: of those that are rounded some come to one value by chance.
+        At least half of the points that ever jump do, in several frames: of those that are rounded some come to one
+        value by chance.
         """
-        (axis, value), rows = max(self._arrivals.items(), key=lambda item: len(item[1]), default=((0, 0.0), set[int]()))
-        return (axis, value, len(rows)) if len(rows) >= max(LEAST_LOST, len(self._jumped) / 2) else None
+        found = [
+            (len(first), axis, value)
+            for (axis, value), first in self._arrivals.items()
+            if len(set(first.values())) >= LEAST_LOST and len(first) >= len(self._jumped) / 2
+        ]
+        count, axis, value = max(found, default=(0, 0, 0.0))
+        return (axis, value, count) if count else None
 
     def add(self, positions: Float[np.ndarray, "n 3"]) -> None:
         """Take the points of one more frame [m], NaN where unseen; rows are those of the frames before, or more."""
         last = np.full_like(positions, np.nan)
         last[: len(self._last)] = self._last
-        step = positions - last
+        step, self._frames = positions - last, self._frames + 1
         rows = np.flatnonzero(np.isfinite(step).all(axis=1))
         self._last = positions  # not those from before a point was hidden: meanwhile its neighbours moved on
         limit = JUMP * self._spacing
@@ -124,7 +131,7 @@ class PointIdentity:
                 self._visitors[_place(place)].add(row)
             axis = int(np.argmax(off))
             if np.delete(off, axis).max() < TAKEN * self._spacing:
-                self._arrivals[axis, _place(after[at])[axis]].add(row)
+                self._arrivals[axis, _place(after[at])[axis]].setdefault(row, self._frames)
             if np.linalg.norm(off) > ISOLATED * self._spacing:
                 self.wild[row] = max(self.wild.get(row, 0.0), float(np.linalg.norm(off)))
 

@@ -15,14 +15,13 @@ MOST = 0.5
 
 
 def point_problems(motion: PointMotion) -> Iterator[RecordingProblem]:
-    """Find points that lose their identity.
+    """Find points that are lost, wild, mixed up, written again or new.
 
     Args:
         motion: of the points, frame by frame.
     """
     if motion.identity is not None:
-        yield from _lost(motion.identity)
-        yield from _exchanged(motion.identity)
+        yield from identity_problems(motion.identity)
     if motion.repeated is not None:
         yield from _repeated(motion.repeated)
     if motion.restarts:
@@ -33,6 +32,12 @@ def point_problems(motion: PointMotion) -> Iterator[RecordingProblem]:
             "start anew? The same track_id must be the same point throughout; points that first come while the sheet "
             "is pulled are of no use.",
         )
+
+
+def identity_problems(identity: PointIdentity) -> Iterator[RecordingProblem]:
+    """Find marks of lost points, wild ones, and rows that are other points in other frames."""
+    yield from _lost(identity)
+    yield from _exchanged(identity)
 
 
 def _lost(identity: PointIdentity) -> Iterator[RecordingProblem]:

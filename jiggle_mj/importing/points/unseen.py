@@ -78,7 +78,8 @@ class MarkCheck:
         alone = always & isolated(positions[0], spacing(positions[0]))
         self._refuse_where(positions, marked & alone, "it is there in every frame, far from all others")
         # As if the sheet were some metres large: its unit is not known here, and rounding grows with the numbers.
-        metres = positions / (_extent(positions) or 1.0)
+        size = _extent(positions) or 1.0
+        metres = positions / size
         identity = PointIdentity(metres[0], spacing(metres[0]))
         for frame in metres:
             identity.add(frame)
@@ -86,6 +87,13 @@ class MarkCheck:
             place, count = identity.shared_place
             there = np.asarray((np.abs(metres - place) <= SAME_PLACE_M).all(axis=2))
             self._refuse_where(positions, there, f"{count} points jump to it at different times")
+        if identity.lost_coordinate is not None:
+            axis, value, count = identity.lost_coordinate
+            raise RecordingError(
+                f"{count} points jump to {'xyz'[axis]} = {value * size:.6g} at different times, and keep the other "
+                "coordinates: that stands for a lost one, such as a depth. Write nan there; if it is right, give "
+                'missing = "none" in [points].'
+            )
 
     def doubted_rows(self, positions: Float[np.ndarray, "t n 3"]) -> list[str]:
         """Return a line where rows are at a usual mark in every frame, while all others move."""

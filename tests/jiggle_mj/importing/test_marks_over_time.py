@@ -49,6 +49,22 @@ def test_a_place_of_lost_points_is_found_in_micrometres_far_from_the_origin(tmp_
         bring_in(where)
 
 
+@pytest.mark.parametrize("depth", [120.0, 400.0])
+def test_a_depth_that_is_lost_for_one_point_a_frame_is_refused(tmp_path, depth):
+    positions = sheet() + np.array([0, 0, depth])
+    for k in range(1, FRAMES):
+        positions[k, 5 * k % 48, 2] = 0
+    with pytest.raises(RecordingError, match=r"11 points jump to z = 0 at different times.*Write nan there"):
+        notes(tmp_path, positions)
+
+
+def test_a_sheet_that_leaves_0_has_lost_no_depth(tmp_path):
+    positions = sheet()
+    positions[:, :, 2] -= positions[:1, :, 2]
+    positions[:, :, 2] += np.linspace(0, 80, FRAMES)[:, None]
+    assert notes(tmp_path, positions, 'layout = "frames, points"') == ()
+
+
 @pytest.mark.parametrize("mark", [0, -1, -999])
 def test_a_row_that_is_at_a_mark_far_from_the_sheet_in_every_frame_is_refused(tmp_path, mark):
     positions = sheet() + 300

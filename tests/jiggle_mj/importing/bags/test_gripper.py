@@ -55,7 +55,7 @@ def test_joints_and_numbers_without_a_rule_are_refused_with_what_they_hold():
 @pytest.mark.parametrize("rule", ["jaw<0.1", "data==0.5", "data>0"])
 def test_a_bool_takes_no_rule_of_numbers(rule: str):
     """False is below 0.1, so that the jaws would be taken the other way round."""
-    with pytest.raises(RecordingError, match="is a Bool.*leave it out where true means closed"):
+    with pytest.raises(RecordingError, match=r"is a Bool.*leave it out where true means closed"):
         jaw_states([0, 1], [True, False], ClosedRule.parse(rule), "/closed")
     opposite, _ = jaw_states([0, 1], [True, False], ClosedRule.parse("data==false"), "/closed")
     assert [state.closed for state in opposite] == [False, True]
