@@ -13,6 +13,11 @@ MAX_SHOWN = 200
 class JiggleError(Exception):
     """Base of the errors that a user can correct: the message says what was given, what is allowed, what to do."""
 
+    def __str__(self) -> str:
+        """Return the message on one line, as what it quotes may hold line breaks and control characters."""
+        text = super().__str__()
+        return text if text.isprintable() else "".join(each if each.isprintable() else " " for each in text)
+
 
 class SceneError(JiggleError):
     """A scene file is missing, malformed or describes something impossible."""

@@ -151,7 +151,7 @@ def test_estimating_from_the_truth_is_refused_in_one_line(complete_run, tmp_path
         (("run", "nosuch.toml", "--out", "x"), 2, r"nosuch.toml"),
         (("estimate", "nosuch.mcap", "--out", "x"), 1, "nosuch.mcap"),
         (("score", "nosuchfolder", "--truth", "nosuch.truth.mcap"), 2, "nosuchfolder"),
-        (("import", "nosuchfolder", "--out", "x.mcap"), 1, "nosuchfolder"),
+        (("import", "nosuchfolder", "--out", "x.mcap"), 2, "nosuchfolder"),
     ],
 )
 def test_what_is_not_there_is_named_in_one_line(arguments, code, name, tmp_path, monkeypatch, capsys):

@@ -217,3 +217,8 @@ def test_a_grasp_that_is_no_grasp_is_refused(tmp_path):
     bag.output.close()
     with pytest.raises(RecordingError, match=r"must be JSON \{closed, grasp, radius\}, and held_tracks"):
         Recording.open(bag.output.path)
+
+
+def test_what_an_error_quotes_stays_on_its_line():
+    """A file may name an encoding with a line break, or with a terminal's escape."""
+    assert str(RecordingError("a.mcap: (protobu\n\x1b[2J) for 5 µm")) == "a.mcap: (protobu  [2J) for 5 µm"
