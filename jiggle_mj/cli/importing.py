@@ -41,6 +41,7 @@ def import_(
     allow_truncated: bool = False,
     overwrite: bool = False,
     allow_outside: bool = False,
+    allow_implausible: bool = False,
     as_json: AsJson = False,
 ) -> None:
     """Convert a robot's bag, or a folder of measured points, to a recording.
@@ -65,6 +66,7 @@ def import_(
         allow_truncated: of a bag: read the complete records of an MCAP file that was cut off.
         overwrite: replace existing files.
         allow_outside: of a folder: read data files outside it where the TOML names them.
+        allow_implausible: keep a recording that the check before an estimate refuses.
         as_json: print a summary to stdout as JSON.
     """
     from ..importing.bags.bag_paths import is_bag
@@ -79,16 +81,26 @@ def import_(
         "clock": clock,
         "allow_truncated": allow_truncated,
     }
-    if is_bag(path):
+    is_ros2_folder = (path / "metadata.yaml").exists()
+    if is_bag(path) and (recording is None or path.is_file() or is_ros2_folder):
         if recording is not None:
             raise OptionError(f"--recording describes a folder of points, and {path} is a bag; use --topics.")
-        _import_bag(path, out, _settings(topics, options), overwrite=overwrite, as_json=as_json)
+        settings = _settings(topics, options)
+        _import_bag(path, out, settings, overwrite=overwrite, allow_implausible=allow_implausible, as_json=as_json)
         return
     given = [name for name, value in {"topics": topics, **options}.items() if value not in (None, (), False)]
     if given:
         raise OptionError(f"--{given[0].replace('_', '-')} is for a bag, and {path} is none.")
     refuse_no_folder(path)
-    _import_folder(path, recording, out, overwrite=overwrite, allow_outside=allow_outside, as_json=as_json)
+    _import_folder(
+        path,
+        recording,
+        out,
+        overwrite=overwrite,
+        allow_outside=allow_outside,
+        allow_implausible=allow_implausible,
+        as_json=as_json,
+    )
 
 
 def inspect(
@@ -136,7 +148,9 @@ def _settings(topics: Path | None, options: dict) -> "BagSettings":
     return with_options(BagSettings() if topics is None else read_map(topics), **options)
 
 
-def _import_bag(path: Path, out: Path, settings: "BagSettings", *, overwrite: bool, as_json: bool) -> None:
+def _import_bag(
+    path: Path, out: Path, settings: "BagSettings", *, overwrite: bool, allow_implausible: bool, as_json: bool
+) -> None:
     from ..importing.bags.importer import import_bag
 
     summary = import_bag(path, out, settings, overwrite=overwrite)
@@ -156,13 +170,20 @@ def _import_bag(path: Path, out: Path, settings: "BagSettings", *, overwrite: bo
         highlight=False,
         soft_wrap=True,
     )
-    show_survey(summary.recording)
+    show_survey(summary.recording, allow_implausible=allow_implausible)
     if as_json:
         print(json.dumps({f.name: getattr(summary, f.name) for f in fields(summary)}, default=str))
 
 
 def _import_folder(
-    folder: Path, recording: Path | None, out: Path, *, overwrite: bool, allow_outside: bool, as_json: bool
+    folder: Path,
+    recording: Path | None,
+    out: Path,
+    *,
+    overwrite: bool,
+    allow_outside: bool,
+    allow_implausible: bool,
+    as_json: bool,
 ) -> None:
     from ..importing.folder import import_folder
 
@@ -175,6 +196,6 @@ def _import_folder(
         f"wrote {summary.recording}: {summary.n_frames} frames of {summary.n_points} points, {summary.n_unseen} "
         f"missing points over all frames, {summary.n_held} held; truth: {summary.truth or 'none'}"
     )
-    show_survey(summary.recording)
+    show_survey(summary.recording, allow_implausible=allow_implausible)
     if as_json:
         print(json.dumps(asdict(summary), default=str))

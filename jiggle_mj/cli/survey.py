@@ -13,16 +13,23 @@ from ..recording.mcap_files import truth_path
 from ..recording.reader import Recording
 from .terminal import console
 
+ALLOW = " (--allow-implausible keeps it nevertheless)"
+"""End of the message of a recording that is refused."""
+
 
 def doubt(text: str) -> None:
     """Print a line about what is doubtful."""
     console.print(text, style="yellow", highlight=False, soft_wrap=True)
 
 
-def show_survey(path: Path) -> Survey:
+def show_survey(path: Path, *, allow_implausible: bool) -> Survey:
     """Print the survey of a recording that was just imported as a table, then what is doubtful about it.
 
     A recording that is refused is removed, with its truth.
+
+    Args:
+        path: the recording.
+        allow_implausible: keep it where the check before an estimate refuses it.
 
     Raises:
         RecordingError: the recording cannot be read, is implausible, or its points show no sheet at rest.
@@ -36,7 +43,7 @@ def show_survey(path: Path) -> Survey:
         for name, value in rows(surveyed):
             table.add_row(name, value)
         console.print(table)
-        refuse_implausible(surveyed, path, log=doubt)
+        refuse_implausible(surveyed, path, log=doubt, allow=allow_implausible, cure=ALLOW)
         if recording.camera is None:
             check_rest(recording.without_images(), recording.declaration)
     except JiggleError as failure:

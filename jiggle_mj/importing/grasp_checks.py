@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from ..errors import RecordingError
 from ..plausibility.held_motion import leading_motion
-from ..plausibility.increments import follow_in_sum
+from ..plausibility.increments import follow_in_sum, no_slip
+from ..plausibility.problems import FARTHEST_EXTENTS
 from .clock import FrameClock
 from .grasps import GraspSpan
 from .recording_toml import MeasuredRecording
@@ -27,8 +28,8 @@ STILL_REFUSED = 0.5
 """Share of the held points that stand still from which they are refused: with fewer, some slip or are lost; half are
 those of another corner."""
 NEAR_SHARE = 0.5
-"""Distance of the tool from its points at which a unit is offered [extent of the sheet]: in a far too small unit the
-tool stays at the origin, which for a sheet around it is 0.7 extents from a corner."""
+"""Distance of the tool from its points at which a unit is offered [extent of the sheet], and difference of their
+motions [that of the points]: in a far too small unit the tool stays at the origin, and a late one does not follow."""
 REFUSED_UNITS = {"inches": 0.0254, "decimetres": 0.1}
 """Metres in further units that a tool may report in; they must be converted."""
 
@@ -50,7 +51,7 @@ def refuse_wrong_grasps(
         clock: times of the frames.
 
     Raises:
-        RecordingError: a tool is farther from the nearest held point than the sheet is large, or half
+        RecordingError: a tool is farther from the nearest held point than three extents of the sheet, or half
             of the held points stand still while the tool, or the rest of them, moves by centimetres.
     """
     for grasp in grasps:
@@ -76,22 +77,24 @@ def _refuse_far(
         return
     tip = reports.at(clock.times[grasp.closing])[0]
     distance = float(np.linalg.norm(places - tip, axis=1).min())
-    if distance <= extent:
+    if distance <= FARTHEST_EXTENTS * extent:
         return
     tool, frame = given.grasp.tool, given.frame
     stated = given.unit if tool is None or tool.unit is None else tool.unit
     closed = range(grasp.closing, grasp.frames[1])
     raw = (np.stack([reports.at(clock.times[k])[0] for k in closed]) - frame.translation) / stated
     held = frames[grasp.closing : grasp.frames[1]][:, grasp.held]
-    # Over the whole grasp: near the origin every small unit is near when the jaws close, and only one moves along.
+    # Over the whole grasp: near the origin every small unit is near when the jaws close.
     away = {
         name: float(np.nanmax(np.linalg.norm(held - (raw * factor + frame.translation)[:, np.newaxis], axis=2)))
         for name, factor in (LENGTH_UNITS | REFUSED_UNITS).items()
     }
     likely = min(away, key=away.__getitem__)
+    middle, tips = np.nanmean(held, axis=1), raw * (LENGTH_UNITS | REFUSED_UNITS)[likely]
+    moved, apart = (float(np.nanmax(np.linalg.norm(each - each[0], axis=1))) for each in (middle, middle - tips))
     cure = (
         ""
-        if away[likely] > NEAR_SHARE * extent
+        if away[likely] > NEAR_SHARE * extent or apart > NEAR_SHARE * moved
         else f"{_unit_cure(likely)}, and it stays within {away[likely]:.3g} m; or "
     )
     raise RecordingError(
@@ -134,7 +137,8 @@ def _refuse_still(
     leader, leading = list(leaders.items())[-1]
     far = float(np.linalg.norm(leading, axis=1).max())
     throughout = moved[:, grasp.held[np.isfinite(moved[:, grasp.held]).all(axis=(0, 2))]]
-    if throughout.shape[1] and follow_in_sum(throughout.mean(axis=1), leading):
+    summed = bool(throughout.shape[1]) and follow_in_sum(throughout.mean(axis=1), leading)
+    if summed and no_slip(throughout.mean(axis=1), leading):
         raise RecordingError(
             f"{grasp.what}: the held points do not follow {leader}, and the sum of their displacements over the frames "
             "does: give displacements from the rest frame, not from the frame before."
@@ -146,8 +150,11 @@ def _refuse_still(
     )
     raise RecordingError(
         f"{grasp.what}: {still} of {len(share)} held points stand still while {leader} went "
-        f"{far * 1e3:.3g} mm, so they are not what it holds: {cure}."
+        f"{far * 1e3:.3g} mm, so they are not what it holds: {cure}{_INCREMENTS if summed else ''}."
     )
+
+
+_INCREMENTS = "; or, where these are displacements, give those from the rest frame, not from the frame before"
 
 
 def _shares(moved: Float[np.ndarray, "t h 3"], leading: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, " h"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import RecordingError
-from .grasp_table import NearPlace
+from .grasp_table import DEFAULT_GRASP_RADIUS, NearPlace
 from .recording_toml import Extension, Margin, MeasuredRecording, Region
 
 MAX_SIZE = 1.0
@@ -46,11 +46,11 @@ def refuse_large_lengths(given: MeasuredRecording, rest: Float[np.ndarray, "n 3"
 def _lengths(given: MeasuredRecording, seen: Float[np.ndarray, "m 3"], steps: list[int]) -> Iterator[Length]:
     grasp, path = given.grasp, given.grasp.path
     for each in grasp.grasps:
-        yield f"{each.where} radius is", each.radius, MAX_SIZE
+        yield _radius(each.where, each.radius)
         if isinstance(each.held, NearPlace) and each.held.at is not None:
             yield _place(f"{each.where} at", each.held.at, seen)
     if path is not None:
-        yield "[grasp] radius is", grasp.path_radius, MAX_SIZE
+        yield _radius("[grasp]", grasp.path_radius)
         yield _place("[grasp] start", path.start, seen)
         yield "[grasp] step makes", abs(path.step) * max(map(abs, steps)), MAX_REACH
     if given.margin is not None:
@@ -60,6 +60,11 @@ def _lengths(given: MeasuredRecording, seen: Float[np.ndarray, "m 3"], steps: li
     if isinstance(given.attached, Region):
         yield _place("[truth] attached_at", given.attached.at, seen)
         yield "[truth] attached_within is", given.attached.radius, MAX_REACH
+
+
+def _radius(where: str, radius: float) -> Length:
+    default = ", which is the default: give a smaller one; it" if radius == DEFAULT_GRASP_RADIUS else ""
+    return f"{where} radius{default} is", radius, MAX_SIZE
 
 
 def _of_margin(margin: Margin) -> Iterator[Length]:

@@ -13,7 +13,7 @@ from .data_folder import DataFolder, quoted
 from .points.array_frames import read_array_frames
 from .points.file_kinds import FileKind, file_kind
 from .points.frame_order import frame_files
-from .points.increments import doubt_increments
+from .points.increment_doubts import doubt_increments
 from .points.measured import Measured, PointFrames, displaced, in_space
 from .points.mesh_frames import read_mesh_frames
 from .points.points_table import PointFiles

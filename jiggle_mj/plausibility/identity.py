@@ -5,7 +5,7 @@ another one should be, or where lost points are put. Compares consecutive frames
 noise apart.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,9 +25,9 @@ sheet that moved so would be torn, and noise of that size shows no sheet."""
 ISOLATED = 5.0
 """Distance to the nearest other point, above which one is isolated [spacings]: of points that are strewn at random, one
 in thirty million. One that jumps so far from its neighbours is wild: the sheet would be torn."""
-LEAST_LOST = 3
-"""Frames in which further points come to one coordinate from which it stands for a lost one: of two wild ones it may be
-chance where coordinates are rounded, and what the jaws hold may come to one height in one frame."""
+LEAST_LOST, LOST_SHARE = 3, 0.9
+"""Frames in which further points come to one coordinate from which it stands for a lost one, and share of all jumps in
+that direction: two wild ones may do so by chance where coordinates are rounded, and what the jaws hold in one frame."""
 SAME_PLACE_M = 1e-9
 """Rounding of a place [m]: of the transformation into the world, and finer than any measurement."""
 
@@ -49,9 +49,10 @@ class PointIdentity:
         """Points that are far from all others at rest [m]."""
         self._last: Float[np.ndarray, "n 3"] = np.empty((0, 3))
         self._visitors: defaultdict[Place, set[int]] = defaultdict(set)
-        self._arrivals: defaultdict[tuple[int, float], dict[int, int]] = defaultdict(dict)
+        self._first_arrivals: defaultdict[tuple[int, bool, float], dict[int, int]] = defaultdict(dict)
+        self._n_arrivals = Counter[tuple[int, bool, float]]()
+        self._n_along = Counter[tuple[int, bool]]()
         self._frames = 0
-        self._jumped: set[int] = set()
         self.wild: dict[int, float] = {}
         """Farthest jump away from its neighbours of each point that makes a wild one [m]."""
         self._exchanged: set[int] = set()
@@ -75,29 +76,29 @@ class PointIdentity:
     def lost_coordinate(self) -> tuple[int, float, int] | None:
         """Return the axis whose coordinate most points jump to alone, that value, and their number; None for none.
 
-        At least half of the points that ever jump do, in several frames: of those that are rounded some come to one
-        value by chance.
+        Nearly all that jump along the axis in that direction do, and they do so first in several frames: those that
+        the jaws carry do in one, and come to other values too.
         """
         found = [
             (len(first), axis, value)
-            for (axis, value), first in self._arrivals.items()
-            if len(set(first.values())) >= LEAST_LOST and len(first) >= len(self._jumped) / 2
+            for (axis, up, value), first in self._first_arrivals.items()
+            if len(set(first.values())) >= LEAST_LOST
+            and self._n_arrivals[axis, up, value] >= LOST_SHARE * self._n_along[axis, up]
         ]
         count, axis, value = max(found, default=(0, 0, 0.0))
         return (axis, value, count) if count else None
 
     def add(self, positions: Float[np.ndarray, "n 3"]) -> None:
         """Take the points of one more frame [m], NaN where unseen; rows are those of the frames before, or more."""
-        last = np.full_like(positions, np.nan)
+        self._frames += 1
+        limit, last = JUMP * self._spacing, np.full_like(positions, np.nan)
         last[: len(self._last)] = self._last
-        step, self._frames = positions - last, self._frames + 1
-        rows = np.flatnonzero(np.isfinite(step).all(axis=1))
+        step = positions - last
         self._last = positions  # not those from before a point was hidden: meanwhile its neighbours moved on
-        limit = JUMP * self._spacing
-        if len(rows) <= N_NEIGHBOURS or not limit:
-            return
-        common = np.median(step[rows], axis=0)
-        if not (np.linalg.norm(step[rows] - common, axis=1) > limit).any():
+        if not _any_beyond(step, limit / 3):
+            return  # of steps so short none is further than the limit from a median of others
+        rows = np.flatnonzero(np.isfinite(step).all(axis=1))
+        if len(rows) <= N_NEIGHBOURS or not limit or not _any_beyond(step - np.median(step[rows], axis=0), limit / 3):
             return
         before, after = last[rows], positions[rows]
         around = np.asarray(KDTree(before).query(before, k=N_NEIGHBOURS + 1)[1])[:, 1:]
@@ -107,33 +108,44 @@ class PointIdentity:
         usual, size = float(np.median(stray)), float(np.ptp(before, axis=0).max())
         calm = usual < TAKEN * self._spacing
         mixed = usual > max(MIXED_EXTENT * size, MIXED_SPACINGS * self._spacing)
-        exchanged = jumped if mixed else self._exchanges(before, motion, after, jumped) if calm else jumped[:0]
+        alone = jumped[self._alone(step[rows], around, jumped)]
+        exchanged = jumped if mixed else self._exchanges(before, motion, after, jumped, alone) if calm else jumped[:0]
         if len(exchanged):
             self._exchanged |= set(rows[exchanged].tolist())
             self.exchange_frames += 1
             self.largest_exchange = max(self.largest_exchange, len(exchanged) / len(rows))
         if calm:
-            self._count(rows, before, before + motion, after, np.setdiff1d(jumped, exchanged))
+            off = after - before - motion
+            for at in np.setdiff1d(jumped, exchanged):
+                self._note_coordinate(int(rows[at]), off[at], after[at])
+            for at in np.setdiff1d(alone, exchanged):
+                row, distance = int(rows[at]), float(stray[at])
+                for place in (before[at], after[at]):
+                    self._visitors[_place(place)].add(row)
+                if distance > ISOLATED * self._spacing:
+                    self.wild[row] = max(self.wild.get(row, 0.0), distance)
 
-    def _count(
-        self,
-        rows: Int[np.ndarray, " m"],
-        before: Float[np.ndarray, "m 3"],
-        expected: Float[np.ndarray, "m 3"],
-        after: Float[np.ndarray, "m 3"],
-        jumped: Int[np.ndarray, " j"],
-    ) -> None:
-        """Note where points that jumped come from and go to: each row with its places, and where it should be [m]."""
-        for at in jumped:
-            row, off = int(rows[at]), np.abs(after[at] - expected[at])
-            self._jumped.add(row)
-            for place in (before[at], after[at]):
-                self._visitors[_place(place)].add(row)
-            axis = int(np.argmax(off))
-            if np.delete(off, axis).max() < TAKEN * self._spacing:
-                self._arrivals[axis, _place(after[at])[axis]].setdefault(row, self._frames)
-            if np.linalg.norm(off) > ISOLATED * self._spacing:
-                self.wild[row] = max(self.wild.get(row, 0.0), float(np.linalg.norm(off)))
+    def _alone(
+        self, steps: Float[np.ndarray, "m 3"], around: Int[np.ndarray, "m k"], jumped: Int[np.ndarray, " j"]
+    ) -> Bool[np.ndarray, " j"]:
+        """Return which points that jumped do so alone: those that the jaws carry move as a neighbour does."""
+        apart = np.linalg.norm(steps[around[jumped]] - steps[jumped][:, np.newaxis], axis=2)
+        return np.asarray(apart.min(axis=1) > TAKEN * self._spacing)
+
+    def _note_coordinate(self, row: int, off: Float[np.ndarray, " 3"], after: Float[np.ndarray, " 3"]) -> None:
+        """Note the coordinate that a point comes to that jumped along one axis alone.
+
+        Args:
+            row: the point.
+            off: from where its neighbours' motion puts it [m].
+            after: where it is [m].
+        """
+        axis = int(np.argmax(np.abs(off)))
+        if np.abs(np.delete(off, axis)).max() < TAKEN * self._spacing:
+            up, value = bool(off[axis] > 0), _place(after)[axis]
+            self._n_along[axis, up] += 1
+            self._n_arrivals[axis, up, value] += 1
+            self._first_arrivals[axis, up, value].setdefault(row, self._frames)
 
     def _exchanges(
         self,
@@ -141,6 +153,7 @@ class PointIdentity:
         motion: Float[np.ndarray, "m 3"],
         after: Float[np.ndarray, "m 3"],
         jumped: Int[np.ndarray, " j"],
+        alone: Int[np.ndarray, " a"],
     ) -> Int[np.ndarray, " e"]:
         """Return the points that have taken each other's places, in pairs or larger rings, or all moved on by a row.
 
@@ -149,12 +162,13 @@ class PointIdentity:
             motion: of the neighbours of each [m].
             after: where they are [m].
             jumped: those that jumped.
+            alone: those of them that no neighbour goes along with.
         """
         others = self._taken(before, after)
         if (others < 0).sum() <= len(jumped) and (others[jumped] >= 0).any():
             return np.flatnonzero(others >= 0)  # a sheet that moves by a spacing comes to new places, and jumps nowhere
-        taken = self._taken(before + motion, after[jumped], jumped)
-        points, taken = jumped[taken >= 0], taken[taken >= 0]
+        taken = self._taken(before + motion, after[alone], alone)
+        points, taken = alone[taken >= 0], taken[taken >= 0]
         while len(points):
             ring = np.isin(taken, points) & np.isin(points, taken)
             if ring.all():
@@ -186,6 +200,11 @@ def isolated(rest: Float[np.ndarray, "n 3"], spacing: float | None) -> Bool[np.n
         distance = np.asarray(KDTree(rest[seen]).query(rest[seen], k=2)[0])[:, 1]
         alone[seen] = distance > ISOLATED * spacing
     return alone
+
+
+def _any_beyond(steps: Float[np.ndarray, "n 3"], length: float) -> bool:
+    """Return whether a step is longer; NaN counts as none."""
+    return bool((np.einsum("ni,ni->n", steps, steps) > length**2).any())
 
 
 def _place(position: Float[np.ndarray, " 3"]) -> Place:

@@ -50,8 +50,18 @@ def follow_in_sum(held: Float[np.ndarray, "t 3"], tool: Float[np.ndarray, "t 3"]
     farthest = float(np.linalg.norm(tool, axis=1).max(initial=0.0))
     if len(tool) < MIN_FRAMES or not np.isfinite(held).all() or not farthest:
         return False
-    alone, summed = (float(np.linalg.norm(each - tool, axis=1).max()) for each in (held, np.cumsum(held, axis=0)))
+    sums, turned = np.cumsum(held, axis=0), tool - _steady(tool)
+    if np.linalg.norm(turned, axis=1).max() > FOLLOWS * farthest:
+        # The displacement when the jaws closed was taken off, which is an increment and adds up in every frame.
+        sums = sums + _steady(tool - sums)
+    alone, summed = (float(np.linalg.norm(each - tool, axis=1).max()) for each in (held, sums))
     return alone > STRAYS * farthest and summed < FOLLOWS * farthest
+
+
+def _steady(places: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:
+    """Return the motion at a constant speed from 0 that is nearest to places."""
+    frames = np.arange(len(places))[:, np.newaxis]
+    return frames * (frames * places).sum(axis=0) / (frames**2).sum()
 
 
 def no_slip(held: Float[np.ndarray, "t 3"], tool: Float[np.ndarray, "t 3"]) -> bool:
@@ -71,4 +81,5 @@ def no_slip(held: Float[np.ndarray, "t 3"], tool: Float[np.ndarray, "t 3"]) -> b
     columns = [tool, direction, *(np.tile(axis, (len(tool), 1)) for axis in np.eye(3))]
     design = np.stack([column.ravel() for column in columns], axis=1)
     slipped = held.ravel() - design @ np.linalg.lstsq(design, held.ravel(), rcond=None)[0]
-    return rms(held - steps) < EXPLAINED * rms(slipped.reshape(-1, 3))
+    stepped = held - steps
+    return rms(stepped - stepped.mean(axis=0)) < EXPLAINED * rms(slipped.reshape(-1, 3))

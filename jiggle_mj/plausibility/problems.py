@@ -242,7 +242,7 @@ def _noise(survey: Survey) -> Iterator[RecordingProblem]:
             f"the noise is declared as {metres(declared)} and measured as {metres(measured)} ({survey.noise_from}); "
             "the estimate would be too sure: set noise_sd to what is measured.",
         )
-    elif survey.noise_from == "still frames" and declared > NOISE_MULTIPLES * measured:
+    elif survey.noise_from == "still frames" and declared > NOISE_MULTIPLES * measured > 0:  # 0: rounded, or none
         yield _warn(
             "noise",
             f"the noise is declared as {metres(declared)}, and still frames show {metres(measured)}; unless it has "

@@ -13,6 +13,7 @@ from ..camera import StereoCamera
 from ..observation import ToolState
 from ..recording.reader import Recording
 from .closed_tool import NS, ClosedTool
+from .declaration_problems import declaration_problems
 from .grip_share import grip_share
 from .held_motion import HeldMotion
 from .image_problems import image_problems
@@ -154,6 +155,8 @@ def survey(recording: Recording) -> Survey:
     why = None if closed.by_points else why_apart(track, noise_sd=sd)
     doubts = list[RecordingProblem]()
     doubts += point_problems(motion)
+    if recording.declared:
+        doubts += declaration_problems(recording.declaration, None if rest is None else extent(rest))
     if rest is not None:
         gravity = np.array(recording.declaration.gravity)
         if not closed.by_points:

@@ -93,8 +93,8 @@ def _clock_problem(fit: ClockFit) -> RecordingProblem:
         name="tool-clock",
         refuses=False,
         text=f"{after} its reports are taken {abs(fit.late):.2g} s {'earlier' if late else 'later'}; add "
-        f"{-fit.late:.2g} to tool_clock_offset or to the tool's stamps, unless close-loop shall estimate it as "
-        f"{'tool_latency' if late else 'image_latency'}.",
+        f"{-fit.late:.2g} to tool_clock_offset or to the tool's stamps, unless the points slip, or close-loop "
+        f"shall estimate it as {'tool_latency' if late else 'image_latency'}.",
     )
 
 

@@ -67,11 +67,12 @@ def displaced(measured: Measured) -> Float[np.ndarray, "t n c"]:
     moves = _moves(positions)
     if given is None:
         if measured.unused_displacements and not moves and len(positions) > 1:
-            listed = ", ".join(f'"{name}"' for name in measured.unused_displacements)
+            names = [f'"{name}"' for name in measured.unused_displacements]
+            listed = names[0] if len(names) == 1 else f"[{', '.join(names)}]"
             raise RecordingError(
                 f"nothing moves in {len(positions)} frames, {measured.names[0]} to {measured.names[-1]}: the "
                 f"positions are those of the reference. The file has displacements: give displacements = "
-                f"[{listed}] in [points]."
+                f"{listed} in [points]."
             )
         return positions
     if measured.by_format:

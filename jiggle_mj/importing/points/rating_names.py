@@ -5,7 +5,7 @@ import re
 WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 """A word of a name such as `is_visible`, `trackStatus` or `VIS2`."""
 HIDDEN_WORD = re.compile(
-    r"(?:is)?(?:lost|hidden|unseen|missing|masked|bad|fail(?:ed|s|ures?)?|drop(?:ped|outs?)|reject\w*)"
+    r"(?:is)?(?:nans?|exclud\w*|ignor\w*|lost|hidden|unseen|missing|masked|bad|fail(?:ed|s|ures?)?|drop(?:ped|outs?)|reject\w*)"
     r"|\w*(?<!un)(?<!non)(?<!not)(?:occlu|outlier)\w*|\w*(?:in|un|not)vis(?:ib\w*)?|\w*(?:in|not)valid\w*|notseen"
 )
 """A word that is true, or large, where a point is not seen."""

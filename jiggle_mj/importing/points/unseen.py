@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ...errors import RecordingError
-from ...plausibility.identity import SAME_PLACE_M, PointIdentity, isolated
+from ...plausibility.identity import JUMP, SAME_PLACE_M, PointIdentity, isolated
 from ...plausibility.point_motion import spacing
 from ..data_folder import quoted
 
@@ -73,7 +73,7 @@ class MarkCheck:
         partly = marked & ~always
         jumped = partly & (_jump(positions) > _extent(positions))
         zero = np.asarray((positions == 0).all(axis=2))
-        at_origin = partly & zero & ~marked[0]
+        at_origin = partly & zero & ~marked[0] & (_step(positions) > JUMP * (spacing(positions[0]) or 0.0))
         self._refuse_where(positions, np.asarray(jumped | at_origin), "it is elsewhere in other frames")
         alone = always & isolated(positions[0], spacing(positions[0]))
         self._refuse_where(positions, marked & alone, "it is there in every frame, far from all others")
@@ -146,6 +146,12 @@ def _jump(positions: Float[np.ndarray, "t n 3"]) -> Float[np.ndarray, "t n"]:
     jump = np.zeros(positions.shape[:2])
     jump[:, seen] = np.linalg.norm(positions[:, seen] - np.median(positions[:, seen], axis=0), axis=2)
     return jump
+
+
+def _step(positions: Float[np.ndarray, "t n 3"]) -> Float[np.ndarray, "t n"]:
+    """Return how far each point goes to a frame; 0 to the first one, and where it was unseen before."""
+    step = np.linalg.norm(np.diff(positions, axis=0, prepend=positions[:1]), axis=2)
+    return np.nan_to_num(step)
 
 
 def _extent(positions: Float[np.ndarray, "t n 3"]) -> float:

@@ -107,7 +107,10 @@ def test_displacements_from_frame_to_frame_are_refused_as_such(tmp_path, lost):
     toml = TOML_OF_ARRAY.replace("[grasp]", '[grasp]\ntool = "t"')
     where = folder(tmp_path, toml=toml.replace('key = "p"', 'key = "p"\ndisplacements = "u"'))
     np.savez(where / "d.npz", p=np.repeat(positions[:1], FRAMES, axis=0), u=steps, t=tool)
-    with pytest.raises(RecordingError, match="the sum of their displacements over the frames does"):
+    with pytest.raises(
+        RecordingError,
+        match=r"stand still while the tool .* where these are displacements, give those from the rest frame",
+    ):
         bring_in(where)
 
 

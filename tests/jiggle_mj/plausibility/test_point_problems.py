@@ -173,6 +173,28 @@ def test_displacements_from_frame_to_frame_are_doubted_at_a_constant_speed(tmp_p
     assert ("increments" in refused, "increments" in doubted) == (False, True)
 
 
+@pytest.mark.parametrize("rounded", [None, 5, 4])
+def test_a_patch_that_the_jaws_carry_up_and_down_is_no_mark(tmp_path, rounded):
+    """Nothing around it moves, and it goes by several spacings from frame to frame, again and again to one height."""
+    rng, patch = np.random.default_rng(3), np.linalg.norm(REST - REST[65], axis=1) < 9e-3
+    height = 25e-3 * (np.arange(-N_STILL, N_CLOSED) % 2) * (np.arange(-N_STILL, N_CLOSED) > 0)
+    positions = REST + height[:, None, None] * patch[:, None] * np.array([0, 0, 1.0])
+    positions += 0.0 if rounded is None else rng.normal(scale=1e-4, size=positions.shape)
+    positions = positions if rounded is None else np.round(positions, rounded)
+    names = {each.name for each in found(tmp_path, positions)[0].doubts}
+    assert not names & {"lost-mark", "identities", "wild"}
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+def test_depths_that_are_lost_behind_the_tool_are_found(tmp_path, noise):
+    """A disc of 8 mm goes over the sheet, and what it hides has depth 0: neighbours jump alike."""
+    rng, across = np.random.default_rng(3), np.linspace(5e-3, 50e-3, N_STILL + N_CLOSED)
+    positions = lifted(sd=0.0) + rng.normal(scale=noise, size=lifted().shape) + np.array([0, 0, 0.15])
+    for frame, x in zip(positions[1:], across[1:], strict=True):
+        frame[np.linalg.norm(REST[:, :2] - (x, 30e-3), axis=1) < 8e-3, 2] = 0.0
+    assert "lost-mark" in found(tmp_path, positions)[1]
+
+
 def test_an_exchange_is_counted(tmp_path):
     """Two of 120 points take each other's place in one step."""
     (text,) = [each.text for each in found(tmp_path, changed(exchange))[0].doubts]

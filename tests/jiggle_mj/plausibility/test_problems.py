@@ -1,5 +1,6 @@
 """A recording that cannot be right is refused or doubted by name; one that can be is neither."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.observation import IDENTITY_WXYZ, Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 from jiggle_mj.plausibility.check import refuse_implausible
+from jiggle_mj.plausibility.declaration_problems import declaration_problems
 from jiggle_mj.plausibility.problems import problems
 from jiggle_mj.plausibility.survey import survey
 from jiggle_mj.recording.reader import Recording
@@ -188,3 +190,21 @@ def test_what_is_allowed_is_reported(tmp_path):
     found = surveyed(tmp_path, Lift(still_tool=True).observations())
     refuse_implausible(found, tmp_path / "run.mcap", log=lines.append, allow=True)
     assert [line.split(":")[0] for line in lines] == ["tool-still"]
+
+
+@pytest.mark.parametrize(
+    ("declared", "words"),
+    [
+        ({}, None),
+        ({"gravity": (0.0, 0.0, 0.0), "bed": False}, None),
+        ({"gravity": (0.0, 0.0, -1.0)}, "9.81 on Earth"),
+        ({"gravity": (0.0, 0.0, -98.1)}, "9.81 on Earth"),
+        ({"areal_density": 900.0}, "density times thickness"),
+        ({"membrane_stiffness": 2e6}, "modulus of 2e[+]09 Pa"),
+        ({"thickness": 0.05, "areal_density": 50.0}, "thickness is in metres"),
+    ],
+)
+def test_a_declaration_in_another_unit_is_doubted(declared, words):
+    texts = [each.text for each in declaration_problems(Declaration(**declared), 0.1)]
+    assert len(texts) == (words is not None)
+    assert words is None or re.search(words, texts[0])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jiggle_mj.observation import IDENTITY_WXYZ, Declaration, MeasuredPoints, Observation, ToolState
+from jiggle_mj.plausibility.increments import follow_in_sum
 from jiggle_mj.plausibility.problem import RecordingProblem
 from jiggle_mj.plausibility.problems import problems
 from jiggle_mj.plausibility.survey import survey
@@ -147,6 +148,16 @@ def test_displacements_from_frame_to_frame_are_refused(tmp_path):
         for frame, step in zip(frames, steps, strict=True)
     ]
     assert found(tmp_path, wrong)["increments"].refuses
+
+
+def test_displacements_from_frame_to_frame_are_found_among_much_noise(tmp_path):
+    """Over a hundred frames the noise of the first one adds up to the length of the lift, and may not hide it."""
+    rng, height = np.random.default_rng(3), LIFT * np.sin(np.linspace(0, np.pi, 100))
+    tool = height[:, None] * np.array([0, 0, 1.0])
+    for _ in range(20):
+        held = np.diff(tool, axis=0, prepend=0.0) + rng.normal(scale=SD / 2, size=tool.shape)
+        assert follow_in_sum(held - held[0], tool) and not follow_in_sum(0.1 * tool + held * 0.1, tool)
+        assert not follow_in_sum(rng.normal(scale=SD / 2, size=tool.shape), tool)
 
 
 def test_points_that_friction_drags_along_are_not_refused(tmp_path):

@@ -68,9 +68,14 @@ def _leading(moved: Float[np.ndarray, "t m 3"]) -> Float[np.ndarray, "t 3"]:
 
 
 def _jump(moved: Float[np.ndarray, "t 3"]) -> float:
-    """Return the largest step over the largest displacement; 0 where nothing moves."""
-    largest = float(np.linalg.norm(moved, axis=1).max())
-    return float(np.linalg.norm(np.diff(moved, axis=0), axis=1).max()) / largest if largest else 0.0
+    """Return the largest step away from rest over the largest displacement; 0 where nothing moves.
+
+    Where the jaws let go, a sheet returns in one step.
+    """
+    away = np.linalg.norm(moved, axis=1)
+    largest = float(away.max())
+    steps = np.where(np.diff(away) > 0, np.linalg.norm(np.diff(moved, axis=0), axis=1), 0.0)
+    return float(steps.max()) / largest if largest else 0.0
 
 
 def _alternates(steps: Float[np.ndarray, "s m 3"]) -> bool:
