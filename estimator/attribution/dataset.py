@@ -16,9 +16,9 @@ from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, Tool
 from ..config import EstimatorConfig
 from ..estimator import Estimator
 from ..perception import FrameMask, TissueMask
+from ..perception.still_noise import StillNoise, measure
 from .grasped_frames import ClosedFrame, Timed
 from .held_shape import another_shape
-from .still_noise import StillNoise, measure
 
 ASSUMED_SD = 2e-4
 """Standard deviation of the white and of the smooth noise each, where neither still frames nor the recording give it

@@ -11,7 +11,6 @@ grasp by grasp. At a noisy state instead of the predicted one this would be an e
 effects.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -24,6 +23,7 @@ from ..effects.sheet_model import FrameContext
 from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
 from ..filters.frame import Frame
+from ..filters.smooth_noise import each
 from ..physics.membrane import TriangleMembrane
 from .grasped_frames import ClosedFrame
 from .sheet import PredictedSheet, look, mean_of_held, tool_residual
@@ -70,7 +70,7 @@ class Metric(eqx.Module):
 
     def whitened(self, columns: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
         """Return N^-1 times each column."""
-        return _each(partial(self.balance.whitened, self.frame), columns)
+        return each(partial(self.balance.whitened, self.frame), columns)
 
     def forces(self, residual: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Return the forces H (y - h(x)) of a residual of positions y - h(x) [m]."""
@@ -190,8 +190,8 @@ def _metric(
     noise: Float[Array, "n modes"],
 ) -> Metric:
     smooth = noise[:, None, :, None] * jnp.eye(3)[None, :, None, :]
-    smooth = _each(partial(balance.apply, linear.dr_dx), _observed(frame, smooth.reshape(len(noise), 3, -1)))
-    white = _each(partial(balance.whitened, linear), smooth)
+    smooth = each(partial(balance.apply, linear.dr_dx), _observed(frame, smooth.reshape(len(noise), 3, -1)))
+    white = each(partial(balance.whitened, linear), smooth)
     metric = Metric(
         balance=balance,
         frame=linear,
@@ -199,7 +199,7 @@ def _metric(
         noise=white,
         spread=jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white)),
         fields=fields,
-        white=_each(partial(balance.whitened, linear), fields),
+        white=each(partial(balance.whitened, linear), fields),
         among=jnp.zeros((N_FIELDS, N_FIELDS)),
     )
     return eqx.tree_at(lambda one: one.among, metric, metric.dot(fields, fields, metric.white))
@@ -227,16 +227,11 @@ def _columns(
     dforce, dview, dtool = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
     model = sheet.model(theta, context, frame.displacement)
     e = metric.forces(frame.y - look(model, x)) + linear.unbalanced
-    seen = _each(partial(balance.apply, linear.dr_dx), _observed(frame, dview))
+    seen = each(partial(balance.apply, linear.dr_dx), _observed(frame, dview))
     tool = jnp.concatenate(
         [dtool, jnp.zeros((3, N_FIELDS)), tool_residual(sheet, model, theta, frame, context, x)[:, None]], axis=1
     )
     return jnp.concatenate([dforce - seen, e[:, :, None]], axis=2), tool / tool_sd(frame)
-
-
-def _each(linear_map: Callable[[Array], Array], columns: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
-    """Return a linear map of each column."""
-    return jax.vmap(linear_map, in_axes=2, out_axes=2)(columns)
 
 
 def _observed(frame: ClosedFrame, shift: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:

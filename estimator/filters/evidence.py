@@ -22,18 +22,39 @@ class Evidence(eqx.Module):
     y: Float[Array, "n 3"]
     """Observed positions [m]; anything finite where there is no observation."""
     precision: Float[Array, "n 3 3"]
-    """R^-1, the inverse covariance of each position [1/m^2]; zero where a particle is missing."""
+    """Inverse covariance of each position, with all its noise [1/m^2]; zero where a particle is missing."""
     held: Bool[Array, " n"]
     """Particles in the grip, which follow the tip."""
     force_unknown: Bool[Array, " n"]
     """Particles that the grip may pull at, the held ones included: their balance of forces is unknown."""
+    fields: Float[Array, "n m"] | None = None
+    """F, the part of the noise that neighbours share, as fields of unit amplitude, the same for each coordinate [m]; 0
+    where a particle is missing or held. None where no noise is shared."""
     pull: Pull | None = None
     """The tool's step; None for filters that simulate none."""
 
     def inflated(self, variance: float) -> "Evidence":
         """Return the evidence with `variance` times the variance of what was seen; the held particles keep theirs."""
         precision = jnp.where(self.held[:, None, None], self.precision, self.precision / variance)
-        return eqx.tree_at(lambda evidence: evidence.precision, self, precision)
+        fields = None if self.fields is None else self.fields * jnp.sqrt(variance)
+        return eqx.tree_at(
+            lambda evidence: (evidence.precision, evidence.fields),
+            self,
+            (precision, fields),
+            is_leaf=lambda leaf: leaf is None,
+        )
+
+    @property
+    def white_precision(self) -> Float[Array, "n 3 3"]:
+        """R^-1, the inverse covariance of each position without the noise that neighbours share [1/m^2]."""
+        if self.fields is None:
+            return self.precision
+        shared = jnp.sum(self.fields**2, axis=1)[:, None, None]
+        return jnp.linalg.solve(jnp.eye(3)[None] - shared * self.precision, self.precision)
+
+    def without_fields(self) -> "Evidence":
+        """Return the evidence with all noise taken for that of single particles."""
+        return eqx.tree_at(lambda evidence: evidence.fields, self, None, is_leaf=lambda leaf: leaf is None)
 
     @property
     def seen(self) -> Bool[Array, " n"]:

@@ -16,6 +16,8 @@ The balance is linear in s at the observed state, so the response of a free shee
 needed. Limits: each observed position must belong to a known particle.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -38,6 +40,7 @@ from .config import FilterConfig
 from .evidence import Evidence
 from .frame import Fit, Frame, FrameInformation
 from .noise import ForceResiduals
+from .smooth_noise import FrameNoise, each
 from .tethered import Tethered
 
 STEP_LENGTHS = (0.0, 0.1, 0.25, 0.5, 1.0)
@@ -171,15 +174,17 @@ class ForceBalance(eqx.Module):
     def approach(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Frame:
         """Return the frame linearised at the state that Gauss-Newton steps from x, at fixed s, lead to.
 
+        Where noise is shared, all steps but the last take it for that of single particles, which is faster.
+
         The search ends where a step lowers the cost by less than `FilterConfig.min_cost_decrease` of it, and is cut off
         after `FilterConfig.max_state_steps`: then `Frame.converged` is False.
         """
-        config = self.config
+        config, single = self.config, evidence.without_fields()
 
         def step(state):
             _, x, _, count = state
-            frame = self.linearise(x, s, evidence)
-            following, costs = self._best_along(frame, self._state_step(frame, s, evidence), s, evidence)
+            frame = self.linearise(x, s, single)
+            following, costs = self._best_along(frame, self._state_step(frame, s, single), s, single)
             return frame, following, jnp.nanmin(costs) < (1 - config.min_cost_decrease) * costs[0], count + 1
 
         def unfinished(state):
@@ -187,9 +192,12 @@ class ForceBalance(eqx.Module):
             return decreasing & (count < config.max_state_steps)
 
         # a frame of the right shapes, which the first step replaces
-        shapes = jax.eval_shape(lambda: self.linearise(x, s, evidence))
+        shapes = jax.eval_shape(lambda: self.linearise(x, s, single))
         empty = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
         frame, _, decreasing, _ = jax.lax.while_loop(unfinished, step, (empty, x, jnp.asarray(True), jnp.asarray(0)))
+        if evidence.fields is not None:
+            near = self.linearise(frame.x, s, evidence)
+            frame = self.linearise(self.polish(near, s, evidence), s, evidence)
         return eqx.tree_at(lambda frame: frame.converged, frame, ~decreasing)
 
     def evidence_near(
@@ -219,7 +227,8 @@ class ForceBalance(eqx.Module):
         squares = jnp.einsum("n,npij,nqik->npjqk", weight, dr_dx, dr_dx)
         A = assemble(self.layout, [(self.places, squares)])
         floor = self.config.position_precision_floor
-        A = add_to_diagonal(self.layout, A, evidence.precision + floor * jnp.eye(3)[None])
+        precision, fields = evidence.white_precision + floor * jnp.eye(3)[None], evidence.fields
+        factor = cholesky(add_to_diagonal(self.layout, A, precision))
         return Frame(
             x=x,
             s=s,
@@ -229,7 +238,8 @@ class ForceBalance(eqx.Module):
             dr_dx=dr_dx,
             error=error,
             weight=weight,
-            factor=cholesky(A),
+            factor=factor,
+            smooth=None if fields is None else FrameNoise.build(self.layout, factor, precision, fields),
             converged=jnp.asarray(True),
             innovation=jnp.where(evidence.seen[:, None], evidence.y - x, 0.0),
         )
@@ -238,7 +248,7 @@ class ForceBalance(eqx.Module):
         """Return the state that explains a frame best, for the s of its linearisation."""
         residual = frame.unbalanced + self.apply(frame.dr_dx, frame.innovation)
         pushed = self._transposed(frame.dr_dx, frame.weight[:, None] * residual)
-        position_residual = solve(self.layout, frame.factor, pushed)
+        position_residual = self._solved(frame, pushed)
         return Fit(
             residual=residual,
             force_residual=residual - self.apply(frame.dr_dx, position_residual),
@@ -264,25 +274,35 @@ class ForceBalance(eqx.Module):
         slot = jnp.append(layout.slot, padded)[self.neighbours]
         V = jnp.zeros((padded + 1, 3, padded), spread.dtype).at[slot, :, layout.slot[:, None]].add(spread)[:-1]
         square = lower_square(frame.factor, V.reshape(layout.n_blocks, 3 * layout.width, padded))
-        return jnp.diag(w * jnp.sum(D**2, axis=1)) - square[layout.slot][:, layout.slot]
+        precision = jnp.diag(w * jnp.sum(D**2, axis=1)) - square[layout.slot][:, layout.slot]
+        if frame.smooth is None:
+            return precision
+        pushed = each(partial(self.apply, frame.dr_dx), frame.smooth.states)
+        shared = frame.smooth.whitened(jnp.einsum("ni,nic->nc", w[:, None] * D, pushed))
+        return precision - shared @ shared.T
 
     def whitened(self, frame: Frame, v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Return N^-1 v."""
         pushed = self._transposed(frame.dr_dx, frame.weight[:, None] * v)
-        return frame.weight[:, None] * (v - self.apply(frame.dr_dx, solve(self.layout, frame.factor, pushed)))
+        return frame.weight[:, None] * (v - self.apply(frame.dr_dx, self._solved(frame, pushed)))
 
     def residuals(self, frame: Frame, fit: Fit, evidence: Evidence) -> ForceResiduals:
         """Return the whitened residuals of the frame's fit, with their degrees of freedom."""
-        w, free = frame.weight, evidence.seen & ~evidence.held
+        w, free, smooth = frame.weight, evidence.seen & ~evidence.held, frame.smooth
         fitted = w * window_sums(self.layout, fit.covariance, self.places, frame.dr_dx)
-        root = jnp.linalg.cholesky(jnp.where(free[:, None, None], evidence.precision, jnp.eye(3)))
+        root = jnp.linalg.cholesky(jnp.where(free[:, None, None], evidence.white_precision, jnp.eye(3)))
         root = jnp.where(free[:, None, None], jnp.swapaxes(root, 1, 2), 0.0)
         seen = window_sums(self.layout, fit.covariance, self.own_place, root[:, None])
+        position, position_degrees = fit.position_residual, jnp.sum(jnp.where(free, 3 - seen, 0.0))
+        if smooth is not None:
+            fitted = fitted + w * smooth.spread_of(partial(self.apply, frame.dr_dx))
+            position = position - smooth.explained(position)
+            position_degrees = position_degrees + smooth.added_degrees(root)
         return ForceResiduals(
             force=jnp.sqrt(w)[:, None] * fit.force_residual,
             force_degrees=jnp.sum(jnp.where(w > 0, 3 - fitted, 0.0)),
-            position=jnp.einsum("nij,nj->ni", root, fit.position_residual),
-            position_degrees=jnp.sum(jnp.where(free, 3 - seen, 0.0)),
+            position=jnp.einsum("nij,nj->ni", root, position),
+            position_degrees=position_degrees,
         )
 
     def calibrated(self, frame: Frame, fit: Fit) -> Float[Array, "n 3"]:
@@ -295,6 +315,8 @@ class ForceBalance(eqx.Module):
         frames.
         """
         error = window_sums(self.layout, fit.covariance, self.places, frame.dD_dx)
+        if frame.smooth is not None:
+            error = error + frame.smooth.spread_of(partial(self.apply, frame.dD_dx))
         squared = jnp.sum(frame.dr_ds**2, axis=1)
         share = self.config.error_weight * error / jnp.maximum(squared, MIN_SQUARE)
         return jnp.maximum(1 - share, 0.0)[:, None] * frame.dr_ds
@@ -318,7 +340,9 @@ class ForceBalance(eqx.Module):
         def cost(length: Float[Array, ""]) -> Float[Array, ""]:
             x = frame.x + length * move
             innovation, force = evidence.y - x, jnp.sum(self.unbalanced(x, s) ** 2, axis=1)
-            seen = jnp.einsum("ni,nij,nj->", innovation, evidence.precision, innovation)
+            seen = jnp.einsum("ni,nij,nj->", innovation, evidence.white_precision, innovation)
+            if frame.smooth is not None:
+                seen = seen + frame.smooth.added_cost(innovation)
             return 0.5 * (seen + jnp.sum(weight * force))
 
         lengths = jnp.array(STEP_LENGTHS, move.dtype)
@@ -348,12 +372,19 @@ class ForceBalance(eqx.Module):
 
         With D = b_ref d - f it is r = b_ref d - (1 - s) D and H = b_ref I - (1 - s) dD/dx.
         """
-        pull = jnp.einsum("nij,nj->ni", evidence.precision, evidence.y - frame.x)
+        pull = jnp.einsum("nij,nj->ni", evidence.white_precision, evidence.y - frame.x)
         d, free = frame.x - self.energy.rest, (1 - s)[:, None]
         unbalanced = self.reference * d - free * frame.dr_ds
         weighted = self._weight(frame.error, s, evidence)[:, None] * unbalanced
         push = self.reference * weighted - self._transposed(frame.dD_dx, free * weighted)
-        return solve(self.layout, frame.factor, pull - push)
+        if frame.smooth is not None:
+            pull = pull + frame.smooth.added_pull(evidence.y - frame.x)
+        return self._solved(frame, pull - push)
+
+    def _solved(self, frame: Frame, v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """Return A^-1 v, with the smooth noise in A."""
+        solved = solve(self.layout, frame.factor, v)
+        return solved if frame.smooth is None else solved + frame.smooth.added_state(solved)
 
 
 _settle = eqx.filter_jit(ForceBalance.settle)

@@ -4,6 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
 from ..physics.block_tridiagonal import BlockCholesky, BlockTridiagonal
+from .smooth_noise import FrameNoise
 
 
 class Frame(eqx.Module):
@@ -29,6 +30,8 @@ class Frame(eqx.Module):
     """Cholesky factor of A = R^-1 + H^T W H."""
     innovation: Float[Array, "n 3"]
     """y - x, zero where nothing was seen [m]."""
+    smooth: FrameNoise | None
+    """Noise that neighbours share; None for none."""
     converged: Bool[Array, ""]
     """Whether the search for x, if there was one, ended before its largest number of steps."""
 

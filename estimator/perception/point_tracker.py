@@ -7,7 +7,7 @@ The estimator triangulates the points itself, unless a mesh is declared. Clouds 
 from collections import Counter
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
@@ -16,6 +16,8 @@ from jiggle_mj.observation import DeclaredMesh, MeasuredPoints
 from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
 
 from .config import PointTrackerConfig
+from .robust import usual
+from .still_noise import StillNoise, measure
 from .track import UNSEEN_VARIANCE, Track
 
 
@@ -64,14 +66,31 @@ class PointTracker:
             sheet = Sheet(rest=rest[used], faces=faces)
             rest_variance = still[0].sd ** 2 / np.array([times[i] for i in self.ids.tolist()])
         self._rest_variance: Float[np.ndarray, " n"] = rest_variance
+        positions = np.array([_positions(frame, self.ids) for frame in frames])
+        self._noise = measure([positions], sheet.rest)
+        self._fields = None if self._noise is None else self._shared(self._noise, sheet.rest, sd=still[0].sd)
         return sheet
+
+    def _shared(
+        self, noise: StillNoise, rest: Float[np.ndarray, "n 3"], *, sd: float
+    ) -> Float[np.ndarray, "n modes"] | None:
+        """Return the noise that neighbours share as fields [m], with that of the rest positions; None for none."""
+        fields, _ = noise.fields(rest)
+        return fields * np.sqrt(1 + self._rest_variance / sd**2)[:, np.newaxis] if fields.shape[1] else None
 
     def track(self, points: MeasuredPoints) -> Track:
         """Return the particles of one frame, with the error of the rest positions in their covariance."""
         positions = _positions(_by_id(points), self.ids)
         visible = np.asarray(np.isfinite(positions).all(axis=1))
-        variance = np.where(visible, points.sd**2 + self._rest_variance, UNSEEN_VARIANCE)
-        return Track(positions=positions, covariance=variance[:, None, None] * np.eye(3), visible=visible)
+        measured = 0.0 if self._noise is None or self._fields is None else self._noise.total_sd
+        rest = 1 + self._rest_variance / points.sd**2
+        variance = np.where(visible, max(points.sd, measured) ** 2 * rest, UNSEEN_VARIANCE)
+        return Track(
+            positions=positions,
+            covariance=variance[:, None, None] * np.eye(3),
+            visible=visible,
+            fields=self._fields,
+        )
 
 
 def _by_id(points: MeasuredPoints) -> dict[int, np.ndarray]:
@@ -99,15 +118,6 @@ def _without_outliers(
     distance = np.nansum(squared, axis=(1, 2)) / np.maximum(np.isfinite(squared).sum(axis=(1, 2)), 1)
     kept = usual(distance, times=config.outlier_ratio, rarely=config.max_outlier_share)
     return [frame for frame, keep in zip(frames, kept, strict=True) if keep]
-
-
-def usual(squares: Float[np.ndarray, " t"], *, times: float, rarely: float) -> Bool[np.ndarray, " t"]:
-    """Return which squares are inliers: all but those above `times` the median, if these are at most a share `rarely`.
-
-    If more squares are that large, they are part of the distribution, and all are inliers.
-    """
-    beyond = squares > times * np.median(squares)
-    return ~beyond if beyond.mean() <= rarely else np.ones(len(squares), dtype=bool)
 
 
 def _positions(frame: dict[int, np.ndarray], ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

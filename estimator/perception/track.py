@@ -24,6 +24,9 @@ class Track:
     """Covariance of each position [m^2]; `UNSEEN_VARIANCE` on the diagonal where unseen."""
     visible: Bool[np.ndarray, " n"]
     """Which particles are seen."""
+    fields: Float[np.ndarray, "n modes"] | None = None
+    """The part of the noise that neighbours share, as fields of unit amplitude, the same for each coordinate [m]; the
+    covariance holds it too. None where none is known."""
     uvd: Float[np.ndarray, "n 3"] | None = None
     """Left rectified pixel and disparity [px], an estimate where unseen; None without images."""
 

@@ -1,6 +1,6 @@
 """A small sheet that several tests share, so that JAX compiles its shapes once, and its lifts by our own engine."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import equinox as eqx
@@ -226,6 +226,20 @@ def cloud(x: np.ndarray, seed: int, sd: float) -> np.ndarray:
     corner = sheet().faces[rng.integers(len(sheet().faces), size=1500)]
     weights = rng.dirichlet(np.ones(3), len(corner))
     return np.einsum("pk,pki->pi", weights, x[corner]) + sd * rng.normal(size=(len(corner), 3))
+
+
+def fields() -> np.ndarray:
+    """Return six smooth fields over the sheet, some of them alike, as noise that neighbours share [m]."""
+    along = (sheet().rest[:, :2] - sheet().rest[:, :2].min(axis=0)) / np.ptp(sheet().rest[:, :2], axis=0)
+    waves = np.cos(np.pi * along[:, :1] * np.arange(3)), np.cos(np.pi * along[:, 1:] * np.arange(2))
+    return NOISE * np.einsum("na,nb->nab", *waves).reshape(len(along), 6) @ np.triu(np.ones((6, 6)))
+
+
+def sharing(evidence: Evidence) -> Evidence:
+    """Return the evidence with more noise, which neighbours share."""
+    shown = np.where(np.asarray(evidence.seen & ~evidence.held)[:, None], fields(), 0.0)
+    covariance = np.linalg.inv(evidence.precision) + np.sum(shown**2, axis=1)[:, None, None] * np.eye(3)
+    return replace(evidence, precision=jnp.asarray(np.linalg.inv(covariance)), fields=jnp.asarray(shown))
 
 
 def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:

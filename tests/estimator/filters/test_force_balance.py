@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from tests.support.small_sheet import (
     equilateral,
     jittered,
     lifts,
+    sharing,
     sheet,
     sheet_balance,
     sheet_energy,
@@ -33,6 +35,8 @@ DENSE_ROUNDING = 1e-7
 """Relative rounding of the dense formula, which inverts 3n x 3n matrices of stiffnesses and precisions [1]."""
 VECTOR_ROUNDING = 1e-6
 """The same for products of those inverses with residual forces, which cancel in part [1]."""
+SLOPE_LEFT = 1e-4
+"""Share of the slope that a line search in steps of a tenth leaves."""
 DIFFERENCE_ROUNDING = 1e-8
 """Rounding of a central difference of forces, exact otherwise as r is linear in s [N]."""
 
@@ -48,14 +52,17 @@ def balance() -> ForceBalance:
     return sheet_balance(FORCE_SD, FORCE_LEVEL)
 
 
-def test_information_equals_the_dense_formula(balance):
+@pytest.mark.parametrize("shared", [False, True])
+def test_information_equals_the_dense_formula(balance, shared):
     """Precision, score and chi2 are D^T N^-1 D, -D^T N^-1 e and e^T N^-1 e over free particles, with N = V + H R H^T.
 
     tau grows, from FORCE_SD, with the sum of the forces of the elements around a particle. D is shrunk by a multiple of
-    the share that its error makes up, by the covariance of x given all that was seen.
+    the share that its error makes up, by the covariance of x given all that was seen. Noise that neighbours share is
+    part of R.
     """
     frame = lifts()[3]
-    seen, x = evidence(frame, 1), frame.x
+    white, x = evidence(frame, 1), frame.x
+    seen = sharing(white) if shared else white
     s = np.random.default_rng(0).uniform(0, 1, N)
     s[:5] = 1
     found = information(balance, jnp.asarray(x), jnp.asarray(s), seen)
@@ -69,9 +76,11 @@ def test_information_equals_the_dense_formula(balance):
     D = np.zeros((3 * N, N))
     for i in range(N):
         R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = np.linalg.inv(
-            np.asarray(seen.precision)[i] + CONFIG.position_precision_floor * np.eye(3)
+            np.asarray(white.precision)[i] + CONFIG.position_precision_floor * np.eye(3)
         )
         D[3 * i : 3 * i + 3, i] = K * d[i] - internal[i]
+    if seen.fields is not None:
+        R += np.kron(seen.fields @ seen.fields.T, np.eye(3))
     flow = np.zeros(N)
     for term in sheet_energy().terms:
         forces = np.asarray(eqx.filter_jit(term.gradient)(jnp.asarray(x[np.asarray(term.vertices)])))
@@ -129,6 +138,26 @@ def test_a_search_that_is_cut_off_says_so(balance):
     search = eqx.filter_jit(lambda balance: balance.approach(seen.y, s, seen).converged)
     assert search(balance)
     assert not search(replace(balance, config=FilterConfig(max_state_steps=1)))
+
+
+def test_steps_end_where_the_cost_has_no_slope(balance):
+    """With shared noise, at fixed weights: the slope of what was seen and that of the forces cancel."""
+    white, s = evidence(lifts()[3], 3), jnp.zeros(N)
+    seen = sharing(white)
+    frame = eqx.filter_jit(balance.approach)(jnp.asarray(lifts()[3].x), s, seen)
+    for _ in range(30):
+        x = eqx.filter_jit(balance.polish)(frame, s, seen)
+        frame = eqx.filter_jit(balance.linearise)(x, s, seen)
+    R = np.zeros((3 * N, 3 * N))
+    for i, precision in enumerate(np.asarray(white.precision)):
+        R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = np.linalg.inv(precision)
+    shared = np.asarray(seen.fields)
+    R += np.kron(shared @ shared.T, np.eye(3))
+    by_seen = np.linalg.solve(R, np.asarray(seen.y - frame.x).ravel())
+    by_force = eqx.filter_jit(jax.grad(lambda x: 0.5 * jnp.sum(frame.weight[:, None] * balance.unbalanced(x, s) ** 2)))(
+        frame.x
+    )
+    np.testing.assert_allclose(by_seen, np.asarray(by_force).ravel(), atol=SLOPE_LEFT * np.abs(by_seen).max())
 
 
 def test_evidence_only_sharpens(balance):

@@ -23,6 +23,7 @@ from tests.support.small_sheet import (
     lifts,
     nees,
     observed,
+    sharing,
     sheet,
     sheet_filter,
 )
@@ -101,6 +102,22 @@ def test_errors_are_as_large_as_their_covariance_claims():
     The bars are wide, as three runs hold few independent errors: those of one run's particles are correlated.
     """
     assert 0.3 < np.mean([nees(summary.belief) for _, summary in runs(STIFFNESS)]) < 2
+
+
+def test_noise_that_neighbours_share_leaves_errors_as_large_as_claimed():
+    """Taken for that of single particles, the same noise makes the belief sure and wrong: a NEES of 20 to 2000."""
+    found: dict[bool, list[float]] = {True: [], False: []}
+    for seed in SEEDS:
+        draw, seen = np.random.default_rng(seed), list[Evidence]()
+        for k, frame in enumerate(lifts()):
+            one = sharing(observed(frame, 100 * seed + k))
+            assert one.fields is not None
+            seen.append(replace(one, y=one.y + one.fields @ draw.normal(size=(one.fields.shape[1], 3))))
+        for counted, errors in found.items():
+            evidence = seen if counted else [one.without_fields() for one in seen]
+            errors.append(nees(follow(implicit(), lifts(), evidence)[2].belief))
+    assert 0.3 < np.mean(found[True]) < 2
+    assert np.min(found[False]) > 10
 
 
 @pytest.mark.parametrize("stiffness", SOFT_TO_RIGID)

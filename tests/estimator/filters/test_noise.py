@@ -12,25 +12,29 @@ import pytest
 from jiggle_mj.estimator.filters.force_balance import ForceBalance
 from jiggle_mj.estimator.filters.noise import ForceResiduals, Noise
 from jiggle_mj.estimator.filters.posterior_summary import PosteriorSummary
-from tests.support.small_sheet import NOISE, attached, follow, lifts, observed, sheet_balance, sheet_filter
+from tests.support.small_sheet import NOISE, attached, follow, lifts, observed, sharing, sheet_balance, sheet_filter
 
 FORCE_SD = 1e-3
 DRAWS = 60
 
 
-@pytest.fixture(scope="module")
-def drawn() -> list[ForceResiduals]:
+@pytest.fixture(scope="module", params=[False, True], ids=["white", "shared"])
+def drawn(request: pytest.FixtureRequest) -> list[ForceResiduals]:
     """Return residuals of frames with errors drawn from the model, at a lifted state with s = 0.5 attached."""
     balance, truth = sheet_balance(FORCE_SD), lifts()[3]
     seen, s = observed(truth, 0), jnp.asarray(0.5 * attached())
+    seen = sharing(seen) if request.param else seen
     frame = eqx.filter_jit(balance.linearise)(jnp.asarray(truth.x), s, seen)
 
     @eqx.filter_jit
     def residuals(balance: ForceBalance, draw: jax.Array) -> ForceResiduals:
         own, others = jax.random.normal(draw, (2, *frame.x.shape))
+        smooth = jax.random.normal(draw, (6, 3))
         sd = jnp.where(frame.weight > 0, 1 / jnp.sqrt(frame.weight), 0.0)
-        seen_sd = 1 / jnp.sqrt(seen.precision[:, 0, 0])
+        seen_sd = 1 / jnp.sqrt(seen.white_precision[:, 0, 0])
         parts = sd[:, None] * own, seen_sd[:, None] * others
+        if seen.fields is not None:
+            parts = parts[0], parts[1] + seen.fields @ smooth
         off_balance = eqx.tree_at(lambda one: (one.unbalanced, one.innovation), frame, parts)
         return balance.residuals(off_balance, balance.fit(off_balance), seen)
 

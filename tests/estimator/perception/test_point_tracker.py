@@ -67,3 +67,27 @@ def test_frames_that_differ_by_noise_alone_or_half_of_the_time_all_count():
         1e-3,
         abs=3 * SD / np.sqrt(10 * 3 * sheet().n),  # the same ten noises twice
     )
+
+
+def test_noise_that_neighbours_share_is_found_in_still_frames():
+    """Half of the variance is shared over 14 mm; the covariance holds all of it, the fields the shared part."""
+    draw, rest = np.random.default_rng(0), sheet().rest
+    squared = np.sum((rest[:, None] - rest[None]) ** 2, axis=2)
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * squared / 0.014**2))
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    white, smooth = draw.normal(size=(2, 20, sheet().n, 3)) * SD / np.sqrt(2)
+    tracker = PointTracker()
+    tracker.start([points(rest + own + root @ shared) for own, shared in zip(white, smooth, strict=True)])
+    track = tracker.track(points(rest))
+    assert track.fields is not None
+    share = np.sum(track.fields**2, axis=1) / track.covariance[:, 0, 0]
+    assert np.mean(share) == pytest.approx(0.5, abs=0.1)  # of few independent values in 20 frames
+    assert track.covariance[:, 0, 0].mean() == pytest.approx(SD**2 * (1 + 1 / 20), rel=2 * SAMPLING)
+
+
+def test_white_noise_has_no_shared_part():
+    tracker = PointTracker()
+    tracker.start([points(noisy(seed)) for seed in range(20)])
+    track = tracker.track(points(sheet().rest))
+    assert track.fields is None
+    np.testing.assert_allclose(track.covariance[:, 0, 0], SD**2 * (1 + 1 / 20))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.attribution.still_noise import MAX_MODES, MODE_MULTIPLE, StillNoise, measure
+from jiggle_mj.estimator.perception.still_noise import MAX_MODES, MODE_MULTIPLE, StillNoise, measure
 from tests.support.small_sheet import sheet
 
 NOISE_ERROR = 0.25

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from ..perception.point_tracker import usual
+from .robust import usual
 
 N_PAIRS = 20_000
 """Random pairs of points from which the covariance is measured."""
@@ -29,6 +29,9 @@ KEPT_VARIANCE = 0.97
 """Share of the smooth part's variance that the fields hold; the rest counts as white."""
 MIN_MODE_VARIANCE = 0.5
 """Smallest variance of a field [variances of the white part]; the others count as white."""
+SIGNIFICANT = 6.0
+"""Variance of the smooth part above which it is one [standard errors of white noise, over the ranges that are tried]:
+of white noise it is up to 3."""
 MIN_FRAMES = 5
 """Smallest number of still frames from which noise is measured."""
 MIN_OBSERVED = 0.9
@@ -53,6 +56,11 @@ class StillNoise:
     """Range of the smooth part [m]."""
     frames: int
     """Number of still frames; 0 if the noise is assumed."""
+
+    @property
+    def total_sd(self) -> float:
+        """Return the standard deviation of both parts together [m]."""
+        return float(np.hypot(self.sd, self.smooth_sd))
 
     def fields(self, rest: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n modes"], float]:
         """Return the smooth part as fields of unit amplitude [m], and the sd of the rest, white part included [m]."""
@@ -92,11 +100,13 @@ def measure(
     i, j = i[i != j], j[i != j]
     squared_distance = np.sum((rest[seen][i] - rest[seen][j]) ** 2, axis=1)
     covariance = np.mean(difference[:, i] * difference[:, j], axis=(0, 2))
+    pair_error = total / np.sqrt(3 * len(difference))
     lengths = float(np.ptp(rest, axis=0).max()) * LENGTHS
     best = (np.inf, 0.0, float(lengths[0]))
     for length in lengths:
         kernel = np.exp(-0.5 * squared_distance / length**2)
-        amplitude = max(float(kernel @ covariance / (kernel @ kernel)), 0.0)
+        amplitude, error = float(kernel @ covariance / (kernel @ kernel)), pair_error / float(np.sqrt(kernel @ kernel))
+        amplitude = amplitude if amplitude > SIGNIFICANT * error else 0.0
         best = min(best, (float(np.sum((covariance - amplitude * kernel) ** 2)), amplitude, float(length)))
     smooth = min(best[1], MAX_SMOOTH_SHARE * total)
     return StillNoise(sd=np.sqrt(total - smooth), smooth_sd=np.sqrt(smooth), length=best[2], frames=frames)
