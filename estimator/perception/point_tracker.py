@@ -66,6 +66,7 @@ class PointTracker:
             sheet = Sheet(rest=rest[used], faces=faces)
             rest_variance = still[0].sd ** 2 / np.array([times[i] for i in self.ids.tolist()])
         self._rest_variance: Float[np.ndarray, " n"] = rest_variance
+        self._still_sd = still[0].sd
         positions = np.array([_positions(frame, self.ids) for frame in frames])
         self._noise = measure([positions], sheet.rest)
         self._fields = None if self._noise is None else self._shared(self._noise, sheet.rest, sd=still[0].sd)
@@ -83,8 +84,8 @@ class PointTracker:
         positions = _positions(_by_id(points), self.ids)
         visible = np.asarray(np.isfinite(positions).all(axis=1))
         measured = 0.0 if self._noise is None or self._fields is None else self._noise.total_sd
-        rest = 1 + self._rest_variance / points.sd**2
-        variance = np.where(visible, max(points.sd, measured) ** 2 * rest, UNSEEN_VARIANCE)
+        rest = max(1.0, measured / self._still_sd) ** 2 * self._rest_variance
+        variance = np.where(visible, max(points.sd, measured) ** 2 + rest, UNSEEN_VARIANCE)
         return Track(
             positions=positions,
             covariance=variance[:, None, None] * np.eye(3),

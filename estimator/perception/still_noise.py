@@ -11,7 +11,7 @@ count; and never from the residual of a fit, which holds the effects that are se
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .robust import usual
 
@@ -31,7 +31,7 @@ MIN_MODE_VARIANCE = 0.5
 """Smallest variance of a field [variances of the white part]; the others count as white."""
 SIGNIFICANT = 6.0
 """Variance of the smooth part above which it is one [standard errors of white noise, over the ranges that are tried]:
-of white noise it is up to 3."""
+of white noise it is up to 5."""
 MIN_FRAMES = 5
 """Smallest number of still frames from which noise is measured."""
 MIN_OBSERVED = 0.9
@@ -91,22 +91,32 @@ def measure(
     if frames < MIN_FRAMES:
         return None
     seen = np.isfinite(difference).mean(axis=(0, 2)) > MIN_OBSERVED
-    difference = difference[np.isfinite(difference[:, seen]).all(axis=(1, 2))][:, seen]
-    if not len(difference) or seen.sum() < MIN_POINTS:
+    difference = difference[:, seen]
+    difference = difference[np.isfinite(difference).any(axis=(1, 2))]
+    if len(difference) + 1 < MIN_FRAMES or seen.sum() < MIN_POINTS:
         return None
-    difference = difference[usual(np.mean(difference**2, axis=(1, 2)), times=JUMP, rarely=MAX_JUMPS)]
-    total = float(np.mean(difference**2))
-    i, j = np.random.default_rng(seed).integers(0, int(seen.sum()), (2, N_PAIRS))
-    i, j = i[i != j], j[i != j]
+    difference = difference[usual(np.nanmean(difference**2, axis=(1, 2)), times=JUMP, rarely=MAX_JUMPS)]
+    total = float(np.nanmean(difference**2))
+    i, j = _pairs(int(seen.sum()), seed)
     squared_distance = np.sum((rest[seen][i] - rest[seen][j]) ** 2, axis=1)
-    covariance = np.mean(difference[:, i] * difference[:, j], axis=(0, 2))
+    covariance = np.nanmean(difference[:, i] * difference[:, j], axis=(0, 2))
     pair_error = total / np.sqrt(3 * len(difference))
     lengths = float(np.ptp(rest, axis=0).max()) * LENGTHS
     best = (np.inf, 0.0, float(lengths[0]))
     for length in lengths:
         kernel = np.exp(-0.5 * squared_distance / length**2)
+        if kernel @ kernel == 0:
+            continue
         amplitude, error = float(kernel @ covariance / (kernel @ kernel)), pair_error / float(np.sqrt(kernel @ kernel))
         amplitude = amplitude if amplitude > SIGNIFICANT * error else 0.0
         best = min(best, (float(np.sum((covariance - amplitude * kernel) ** 2)), amplitude, float(length)))
     smooth = min(best[1], MAX_SMOOTH_SHARE * total)
     return StillNoise(sd=np.sqrt(total - smooth), smooth_sd=np.sqrt(smooth), length=best[2], frames=frames)
+
+
+def _pairs(n: int, seed: int) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
+    """Return all pairs of n points, or `N_PAIRS` random ones if there are more."""
+    if n * (n - 1) // 2 <= N_PAIRS:
+        return np.triu_indices(n, 1)
+    i, j = np.random.default_rng(seed).integers(0, n, (2, N_PAIRS))
+    return i[i != j], j[i != j]
