@@ -64,6 +64,8 @@ class StillNoise:
 
     def fields(self, rest: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n modes"], float]:
         """Return the smooth part as fields of unit amplitude [m], and the sd of the rest, white part included [m]."""
+        if not self.smooth_sd:
+            return np.zeros((len(rest), 0)), float(self.sd)
         squared = np.sum((rest[:, None] - rest[None]) ** 2, axis=2)
         values, vectors = np.linalg.eigh(np.exp(-0.5 * squared / self.length**2))
         values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
