@@ -68,24 +68,22 @@ class PointTracker:
         self._rest_variance: Float[np.ndarray, " n"] = rest_variance
         self._still_sd = still[0].sd
         positions = np.array([_positions(frame, self.ids) for frame in frames])
-        self._noise = measure([positions], sheet.rest)
-        self._fields = None if self._noise is None else self._shared(self._noise, sheet.rest, sd=still[0].sd)
+        noise = measure([positions], sheet.rest)
+        self._fields = None if noise is None else self._shared(noise, sheet.rest)
+        self._measured_sd = 0.0 if noise is None or self._fields is None else noise.total_sd
         return sheet
 
-    def _shared(
-        self, noise: StillNoise, rest: Float[np.ndarray, "n 3"], *, sd: float
-    ) -> Float[np.ndarray, "n modes"] | None:
+    def _shared(self, noise: StillNoise, rest: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n modes"] | None:
         """Return the noise that neighbours share as fields [m], with that of the rest positions; None for none."""
         fields, _ = noise.fields(rest)
-        return fields * np.sqrt(1 + self._rest_variance / sd**2)[:, np.newaxis] if fields.shape[1] else None
+        return fields * np.sqrt(1 + self._rest_variance / self._still_sd**2)[:, np.newaxis] if fields.shape[1] else None
 
     def track(self, points: MeasuredPoints) -> Track:
         """Return the particles of one frame, with the error of the rest positions in their covariance."""
         positions = _positions(_by_id(points), self.ids)
         visible = np.asarray(np.isfinite(positions).all(axis=1))
-        measured = 0.0 if self._noise is None or self._fields is None else self._noise.total_sd
-        rest = max(1.0, measured / self._still_sd) ** 2 * self._rest_variance
-        variance = np.where(visible, max(points.sd, measured) ** 2 + rest, UNSEEN_VARIANCE)
+        rest = max(1.0, self._measured_sd / self._still_sd) ** 2 * self._rest_variance
+        variance = np.where(visible, max(points.sd, self._measured_sd) ** 2 + rest, UNSEEN_VARIANCE)
         return Track(
             positions=positions,
             covariance=variance[:, None, None] * np.eye(3),

@@ -73,9 +73,10 @@ class MarkCheck:
         partly = marked & ~always
         jumped = partly & (_jump(positions) > _extent(positions))
         zero = np.asarray((positions == 0).all(axis=2))
-        at_origin = partly & zero & ~marked[0] & (_step(positions) > JUMP * (spacing(positions[0]) or 0.0))
+        apart = spacing(positions[0])
+        at_origin = partly & zero & ~marked[0] & (_step(positions) > JUMP * (apart or 0.0))
         self._refuse_where(positions, np.asarray(jumped | at_origin), "it is elsewhere in other frames")
-        alone = always & isolated(positions[0], spacing(positions[0]))
+        alone = always & isolated(positions[0], apart)
         self._refuse_where(positions, marked & alone, "it is there in every frame, far from all others")
         # As if the sheet were some metres large: its unit is not known here, and rounding grows with the numbers.
         size = _extent(positions) or 1.0
