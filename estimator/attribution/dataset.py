@@ -94,7 +94,8 @@ def collect_dataset(
         raise PerceptionError("no frame with closed jaws could be used, so there is nothing to fit effects to.")
     estimator.release()
     noise = _noise_of([still], estimator) or _noise_of(list(resting.values()), estimator) or assumed(stated_sd)
-    fields, sd = noise.fields(estimator.sheet.rest)
+    measured = None if estimator.track_ids is None else estimator.track_ids >= 0
+    fields, sd = noise.fields(estimator.sheet.rest, measured)
     mistaken = another_shape(frames, sd, fields)
     return Dataset(
         estimator=estimator,

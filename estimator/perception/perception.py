@@ -19,7 +19,7 @@ from ..ranges import refuse_many_particles
 from .cloud_tracker import CloudTracker, lay_mesh
 from .config import PerceptionConfig
 from .disparity import Disparity
-from .point_tracker import PointTracker
+from .point_tracker import MESH_CAUSE, PointTracker
 from .stereo_tracker import StereoTracker
 from .tissue_mask import FrameMask, TissueMask
 from .track import Track
@@ -176,10 +176,10 @@ class Perception:
     def _sheet_of_points(self) -> Sheet:
         """Return the sheet at rest of points or clouds, and choose their tracker."""
         if all(points.track_id is not None for points in self._still):
-            sheet = self._points.start(self._still)
-            refuse_many_particles(len(sheet.rest), "one particle for each point")
-            return sheet
+            return self._points.start(self._still)
         declared = self._declaration.mesh
+        if declared is not None:
+            refuse_many_particles(len(declared.vertices), MESH_CAUSE)
         sheet = (
             lay_mesh(self._still, spacing=self._spacing, config=self._config.clouds)
             if declared is None

@@ -7,7 +7,7 @@ The estimator triangulates the points itself, unless a mesh is declared. Clouds 
 from collections import Counter
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
@@ -15,10 +15,14 @@ from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.observation import DeclaredMesh, MeasuredPoints
 from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
 
+from ..ranges import refuse_many_particles
 from .config import PointTrackerConfig
 from .robust import usual
 from .still_noise import StillNoise, measure
 from .track import UNSEEN_VARIANCE, Track
+
+MESH_CAUSE = "the declared mesh"
+"""What gives so many particles, where it does, for the message."""
 
 
 class PointTracker:
@@ -36,11 +40,12 @@ class PointTracker:
         lie elsewhere than in the others: the sheet has moved already.
 
         Raises:
-            PerceptionError: points without identities, or too few of them.
+            PerceptionError: points without identities, too few of them, or too many.
             MeshError: two sheets.
         """
         config, frames = self._config, [_by_id(points) for points in still]
         if self._declared is not None:
+            refuse_many_particles(len(self._declared.vertices), MESH_CAUSE)
             self.ids = self._declared.track_id
             rest_variance = np.full(len(self.ids), _rest_variance(self._declared, frames, still[0].sd))
             sheet = Sheet(rest=self._declared.vertices, faces=self._declared.faces)
@@ -51,6 +56,7 @@ class PointTracker:
                     f"{len(ids)} points are seen in at least {config.min_seen_share:.0%} of the {len(still)} frames at "
                     f"rest; a sheet needs {config.min_points}."
                 )
+            refuse_many_particles(len(ids), "one particle for each point")
             frames = _without_outliers(frames, np.asarray(ids), config)
             times = Counter(i for frame in frames for i in frame)
             rest = np.array([np.mean([frame[i] for frame in frames if i in frame], axis=0) for i in ids])
@@ -69,13 +75,16 @@ class PointTracker:
         self._still_sd = still[0].sd
         positions = np.array([_positions(frame, self.ids) for frame in frames])
         noise = measure([positions], sheet.rest)
-        self._fields = None if noise is None else self._shared(noise, sheet.rest)
+        seen = np.isfinite(positions).all(axis=2).any(axis=0)
+        self._fields = None if noise is None else self._shared(noise, sheet.rest, seen)
         self._measured_sd = 0.0 if noise is None or self._fields is None else noise.total_sd
         return sheet
 
-    def _shared(self, noise: StillNoise, rest: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n modes"] | None:
+    def _shared(
+        self, noise: StillNoise, rest: Float[np.ndarray, "n 3"], seen: Bool[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n modes"] | None:
         """Return the noise that neighbours share as fields [m], with that of the rest positions; None for none."""
-        fields, _ = noise.fields(rest)
+        fields, _ = noise.fields(rest, seen)
         return fields * np.sqrt(1 + self._rest_variance / self._still_sd**2)[:, np.newaxis] if fields.shape[1] else None
 
     def track(self, points: MeasuredPoints) -> Track:

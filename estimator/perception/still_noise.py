@@ -11,9 +11,10 @@ count; and never from the residual of a fit, which holds the effects that are se
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .robust import usual
+from .smooth_modes import smooth_modes
 
 N_PAIRS = 20_000
 """Random pairs of points from which the covariance is measured."""
@@ -62,19 +63,26 @@ class StillNoise:
         """Return the standard deviation of both parts together [m]."""
         return float(np.hypot(self.sd, self.smooth_sd))
 
-    def fields(self, rest: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n modes"], float]:
-        """Return the smooth part as fields of unit amplitude [m], and the sd of the rest, white part included [m]."""
-        if not self.smooth_sd:
-            return np.zeros((len(rest), 0)), float(self.sd)
-        squared = np.sum((rest[:, None] - rest[None]) ** 2, axis=2)
-        values, vectors = np.linalg.eigh(np.exp(-0.5 * squared / self.length**2))
-        values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
-        enough = int(np.searchsorted(np.cumsum(values), KEPT_VARIANCE * values.sum())) + 1
+    def fields(
+        self, rest: Float[np.ndarray, "n 3"], measured: Bool[np.ndarray, " n"] | None = None
+    ) -> tuple[Float[np.ndarray, "n modes"], float]:
+        """Return the smooth part as fields of unit amplitude [m], and the sd of the rest, white part included [m].
+
+        Args:
+            rest: rest positions of all particles [m].
+            measured: particles at which anything is measured, all if None; the fields are 0 at the others.
+        """
+        measured = np.ones(len(rest), dtype=bool) if measured is None else measured
+        if not self.smooth_sd or not measured.any():
+            return np.zeros((len(rest), 0)), self.total_sd
+        modes = smooth_modes(rest[measured], self.length, MAX_MODES)
+        values = np.sum(modes**2, axis=0)
+        enough = int(np.searchsorted(np.cumsum(values), KEPT_VARIANCE * len(modes))) + 1
         matter = int(np.sum(values * self.smooth_sd**2 > MIN_MODE_VARIANCE * self.sd**2))
-        m = min(enough, matter, MAX_MODES)
-        rest_share = 1 - values[:m].sum() / values.sum()
+        m = min(enough, matter, len(values))
+        rest_share = max(0.0, 1 - values[:m].sum() / len(modes))
         fields = np.zeros((len(rest), -(-m // MODE_MULTIPLE) * MODE_MULTIPLE))
-        fields[:, :m] = self.smooth_sd * vectors[:, :m] * np.sqrt(values[:m])
+        fields[measured, :m] = self.smooth_sd * modes[:, :m]
         return fields, float(np.sqrt(self.sd**2 + rest_share * self.smooth_sd**2))
 
 
@@ -103,7 +111,7 @@ def measure(
     squared_distance = np.sum((rest[seen][i] - rest[seen][j]) ** 2, axis=1)
     covariance = np.nanmean(difference[:, i] * difference[:, j], axis=(0, 2))
     pair_error = total / np.sqrt(3 * len(difference))
-    lengths = float(np.ptp(rest, axis=0).max()) * LENGTHS
+    lengths = float(np.ptp(rest[seen], axis=0).max()) * LENGTHS
     best = (np.inf, 0.0, float(lengths[0]))
     for length in lengths:
         kernel = np.exp(-0.5 * squared_distance / length**2)

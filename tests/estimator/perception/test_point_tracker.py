@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimator.perception import PointTracker
-from jiggle_mj.observation import DeclaredMesh, MeasuredPoints
+from jiggle_mj.observation import MAX_PARTICLES, DeclaredMesh, MeasuredPoints
 from tests.support.small_sheet import sheet
 
 SD = 2e-4
@@ -91,3 +92,39 @@ def test_white_noise_has_no_shared_part():
     track = tracker.track(points(sheet().rest))
     assert track.fields is None
     np.testing.assert_allclose(track.covariance[:, 0, 0], SD**2 * (1 + 1 / 20))
+
+
+@pytest.mark.parametrize("declared", [False, True])
+def test_more_points_than_can_be_estimated_are_refused_before_anything_is_computed_from_them(declared):
+    n = MAX_PARTICLES + 1
+    row = np.column_stack([np.arange(n) * 1e-5, np.zeros((n, 2))])
+    ids = np.arange(n)
+    mesh = DeclaredMesh(vertices=row, faces=np.array([[0, 1, 2]]), track_id=ids) if declared else None
+    with pytest.raises(PerceptionError, match="at most 20000 can be estimated"):
+        PointTracker(mesh).start([MeasuredPoints(positions=row, track_id=ids, sd=SD)] * 2)
+
+
+def test_vertices_that_nothing_measures_have_no_shared_noise_and_do_not_change_that_of_the_others():
+    draw, rest = np.random.default_rng(0), sheet().rest
+    squared = np.sum((rest[:, None] - rest[None]) ** 2, axis=2)
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * squared / 0.014**2))
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    white, smooth = draw.normal(size=(2, 20, sheet().n, 3)) * SD / np.sqrt(2)
+    still = [points(rest + own + root @ shared) for own, shared in zip(white, smooth, strict=True)]
+    beyond = rest + [2 * np.ptp(rest[:, 0]), 0.0, 0.0]
+    ids = np.arange(sheet().n)
+    fields = []
+    for vertices, faces, track_id in (
+        (rest, sheet().faces, ids),
+        (
+            np.concatenate([rest, beyond]),
+            np.concatenate([sheet().faces, sheet().faces + sheet().n]),
+            np.append(ids, -np.ones_like(ids)),
+        ),
+    ):
+        tracker = PointTracker(DeclaredMesh(vertices=vertices, faces=faces, track_id=track_id))
+        tracker.start(still)
+        fields.append(tracker.track(still[0]).fields)
+    assert fields[0] is not None and fields[1] is not None
+    np.testing.assert_array_equal(fields[1][: sheet().n], fields[0])
+    assert not np.any(fields[1][sheet().n :])

@@ -53,3 +53,25 @@ def test_a_jump_between_still_frames_is_no_noise():
 
 def test_too_few_still_frames_give_no_noise():
     assert measure([np.zeros((2, 5, 3))], np.zeros((5, 3))) is None
+
+
+def test_fields_are_those_of_the_measured_particles_and_zero_elsewhere():
+    rest, noise = sheet().rest, StillNoise(sd=1e-4, smooth_sd=2e-4, length=0.02, frames=9)
+    measured = rest[:, 0] < np.median(rest[:, 0])
+    fields, white = noise.fields(rest, measured)
+    alone, same = noise.fields(rest[measured])
+    np.testing.assert_array_equal(fields[measured], alone)
+    assert not fields[~measured].any()
+    assert white == same
+
+
+def test_the_range_is_searched_within_the_extent_of_what_is_measured():
+    """A declared mesh may reach far beyond the points; their noise has the same range then."""
+    draw, rest = np.random.default_rng(0), sheet().rest
+    squared_distance = np.sum((rest[:, None] - rest[None]) ** 2, axis=2)
+    root = np.linalg.cholesky(np.exp(-0.5 * squared_distance / 0.012**2) + JITTER * np.eye(len(rest)))
+    smooth = 2e-4 * np.einsum("ij,tjk->tik", root, draw.normal(size=(40, len(rest), 3)))
+    seen = rest[None] + smooth + 1e-4 * draw.normal(size=(40, len(rest), 3))
+    far = np.array([[5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]])
+    wide = np.concatenate([seen, np.full((40, 2, 3), np.nan)], axis=1)
+    assert measure([wide], np.concatenate([rest, far])) == measure([seen], rest)
