@@ -127,7 +127,7 @@ class Estimator:
         hold, before = self._grasp(track, tool)
         frame = fuse(track, hold, tool, before, grip_sd=self.config.grip_sd, field=tracked.field)
         self._slip = frame.slip
-        self._seen_precision = track.precision[track.visible].mean(axis=0)
+        self._seen_precision = track.white_precision[track.visible].mean(axis=0)
         tracked.state, update = tracked.filter.update(tracked.state, frame.evidence, jnp.asarray(frame.start))
         if not update.explains_the_frame:
             raise PerceptionError(
@@ -270,11 +270,22 @@ class Estimator:
     def point_precision(self) -> Float[np.ndarray, "3 3"]:
         """Mean inverse covariance of a seen particle in the latest frame, with the learned noise [1/m^2].
 
+        It is without the noise that neighbours share, which `shared_noise` holds.
+
         Raises:
             ValueError: asked before `begin`.
         """
-        noise = self._tracked.filter.noise(self._tracked.state)
-        return self._seen_precision / (1.0 if noise is None else noise.position)
+        return self._seen_precision / self._tracked.position_variance
+
+    @property
+    def shared_noise(self) -> Float[np.ndarray, "n modes"] | None:
+        """The noise that neighbours share as fields, with the learned noise; see `Track.fields`. None for none [m].
+
+        Raises:
+            ValueError: asked before `begin`.
+        """
+        fields, variance = self._perception.fields, self._tracked.position_variance
+        return None if fields is None else np.asarray(fields) * np.sqrt(variance)
 
     @property
     def sheet(self) -> Sheet:
@@ -374,17 +385,8 @@ class Estimator:
 
     def _grasp(self, track: Track, tool: ToolState) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
         """Return the grasp of a frame, and the state to start from; see `GripTracker.grasp`."""
-        return self._grip.grasp(
-            tool, state=self._tracked.x, rest=self.sheet.rest, track=track, named=self._named_held(tool)
-        )
-
-    def _named_held(self, tool: ToolState) -> Bool[np.ndarray, " n"] | None:
-        """Return the particles that recording or declaration name as held; only tracked points have names."""
-        if (ids := self._perception.track_ids) is None:
-            return None
-        if tool.held_tracks:
-            return np.isin(ids, tool.held_tracks)
-        return None if self.declaration.mesh is None else self.declaration.mesh.held
+        named = self._perception.named_held(tool)
+        return self._grip.grasp(tool, state=self._tracked.x, rest=self.sheet.rest, track=track, named=named)
 
     def _positions_with_open_jaws(self, observation: Observation) -> Float[np.ndarray, "n 3"]:
         """Return where the sheet lies [m]: at rest where nothing identifies its particles."""

@@ -67,7 +67,7 @@ def fuse(
         precision=jnp.asarray(precision),
         held=jnp.asarray(held),
         force_unknown=jnp.asarray(field.dilated(held)),
-        fields=None if track.fields is None else jnp.asarray(np.where((seen & ~held)[:, None], track.fields, 0.0)),
+        fields=track.fields,
         pull=pull(before, tool, hold),
     )
     return FusedFrame(evidence=evidence, start=start, slip=float(np.median(distance)) if len(distance) else 0.0)

@@ -58,6 +58,12 @@ class TrackedSheet:
             open_x=mesh.rest,
         )
 
+    @property
+    def position_variance(self) -> float:
+        """The learned factor on the variance of positions [1]."""
+        noise = self.filter.noise(self.state)
+        return 1.0 if noise is None else noise.position
+
 
 def unfolded(sheet: Sheet) -> tuple[SheetMesh, SheetPlane]:
     """Return the mesh of a sheet at rest, and its plane.

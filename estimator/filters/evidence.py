@@ -28,8 +28,8 @@ class Evidence(eqx.Module):
     force_unknown: Bool[Array, " n"]
     """Particles that the grip may pull at, the held ones included: their balance of forces is unknown."""
     fields: Float[Array, "n m"] | None = None
-    """F, the part of the noise that neighbours share, as fields of unit amplitude, the same for each coordinate [m]; 0
-    where a particle is missing or held. None where no noise is shared."""
+    """F, the part of the noise that neighbours share, as fields of unit amplitude, the same for each coordinate [m].
+    One array serves all frames of a recording: it counts as `seen_fields`. None where no noise is shared."""
     pull: Pull | None = None
     """The tool's step; None for filters that simulate none."""
 
@@ -49,8 +49,15 @@ class Evidence(eqx.Module):
         """R^-1, the inverse covariance of each position without the noise that neighbours share [1/m^2]."""
         if self.fields is None:
             return self.precision
-        shared = jnp.sum(self.fields**2, axis=1)[:, None, None]
+        shared = jnp.sum(self.seen_fields**2, axis=1)[:, None, None]
         return jnp.linalg.solve(jnp.eye(3)[None] - shared * self.precision, self.precision)
+
+    @property
+    def seen_fields(self) -> Float[Array, "n m"]:
+        """F in this frame [m]: 0 where a particle is missing or held, and without columns where no noise is shared."""
+        if self.fields is None:
+            return jnp.zeros((len(self.y), 0), self.y.dtype)
+        return jnp.where((self.seen & ~self.held)[:, None], self.fields, 0.0)
 
     def without_fields(self) -> "Evidence":
         """Return the evidence with all noise taken for that of single particles."""

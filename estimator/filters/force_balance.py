@@ -13,7 +13,7 @@ H = dr/dx, W = cov(n_f)^-1 (0 where the force is unknown), A = R^-1 + H^T W H an
 x leaves the evidence D^T N^-1 D about s. D counts as far as it exceeds its own error (`calibrated`).
 
 The balance is linear in s at the observed state, so the response of a free sheet, which is strongly nonlinear, is never
-needed. Limits: each observed position must belong to a known particle.
+needed. R and A are without the noise that neighbours share (`smooth_noise`). Each position must belong to a particle.
 """
 
 from functools import partial
@@ -227,7 +227,7 @@ class ForceBalance(eqx.Module):
         squares = jnp.einsum("n,npij,nqik->npjqk", weight, dr_dx, dr_dx)
         A = assemble(self.layout, [(self.places, squares)])
         floor = self.config.position_precision_floor
-        precision, fields = evidence.white_precision + floor * jnp.eye(3)[None], evidence.fields
+        precision, fields = evidence.white_precision + floor * jnp.eye(3)[None], evidence.seen_fields
         factor = cholesky(add_to_diagonal(self.layout, A, precision))
         return Frame(
             x=x,
@@ -239,7 +239,7 @@ class ForceBalance(eqx.Module):
             error=error,
             weight=weight,
             factor=factor,
-            smooth=None if fields is None else FrameNoise.build(self.layout, factor, precision, fields),
+            smooth=FrameNoise.build(self.layout, factor, precision, fields) if fields.shape[1] else None,
             converged=jnp.asarray(True),
             innovation=jnp.where(evidence.seen[:, None], evidence.y - x, 0.0),
         )

@@ -27,7 +27,7 @@ class Frame(eqx.Module):
     weight: Float[Array, " n"]
     """W, the inverse variance of each component of r [1/N^2]; 0 where the force is unknown."""
     factor: BlockCholesky
-    """Cholesky factor of A = R^-1 + H^T W H."""
+    """Cholesky factor of A = R^-1 + H^T W H, with R the white noise alone; `smooth` adds what neighbours share."""
     innovation: Float[Array, "n 3"]
     """y - x, zero where nothing was seen [m]."""
     smooth: FrameNoise | None
@@ -46,7 +46,8 @@ class Fit(eqx.Module):
     position_residual: Float[Array, "n 3"]
     """Observed less fitted position [m]."""
     covariance: BlockTridiagonal
-    """Blocks of A^-1 where A has blocks [m^2]: the covariance of the fitted state."""
+    """Blocks of A^-1 where A has blocks [m^2]: the covariance of the fitted state by white noise alone, without what
+    `Frame.smooth` adds to it."""
 
 
 class FrameInformation(eqx.Module):

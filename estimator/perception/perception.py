@@ -6,13 +6,13 @@ It finds the sheet at rest in the frames before the first grasp, and its particl
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jiggle_mj.argument_checks import as_function, as_instance
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import MaskError, PerceptionError
 from jiggle_mj.estimate import Sheet
-from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair
+from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 
 from ..physics.environment import Grip
 from ..ranges import refuse_many_particles
@@ -86,6 +86,19 @@ class Perception:
     def track_ids(self) -> Int[np.ndarray, " n"] | None:
         """Return the track id of each particle; None if points have no identities."""
         return self._points.ids if len(self._points.ids) else None
+
+    def named_held(self, tool: ToolState) -> Bool[np.ndarray, " n"] | None:
+        """Return the particles that recording or declaration name as held; only tracked points have names."""
+        if (ids := self.track_ids) is None:
+            return None
+        if tool.held_tracks:
+            return np.isin(ids, tool.held_tracks)
+        return None if self._declaration.mesh is None else self._declaration.mesh.held
+
+    @property
+    def fields(self) -> Float[Array, "n modes"] | None:
+        """Return the noise that neighbours share, as `Track.fields` has it; None where none is known."""
+        return self._points.fields
 
     def look_at_rest(self, observation: Observation) -> str | None:
         """Use a frame before the first grasp, and return None, or why it is skipped.

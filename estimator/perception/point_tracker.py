@@ -6,8 +6,9 @@ The estimator triangulates the points itself, unless a mesh is declared. Clouds 
 
 from collections import Counter
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
@@ -32,6 +33,7 @@ class PointTracker:
         self._declared, self._config = mesh, config or PointTrackerConfig()
         self.ids = np.empty(0, dtype=np.int64)
         """Track id of each particle, -1 where nothing is measured."""
+        self._fields: Float[Array, "n modes"] | None = None
 
     def start(self, still: list[MeasuredPoints]) -> Sheet:
         """Return the mesh over the mean of one or more frames at rest; a declared mesh is returned unchanged.
@@ -82,10 +84,16 @@ class PointTracker:
 
     def _shared(
         self, noise: StillNoise, rest: Float[np.ndarray, "n 3"], seen: Bool[np.ndarray, " n"]
-    ) -> Float[np.ndarray, "n modes"] | None:
+    ) -> Float[Array, "n modes"] | None:
         """Return the noise that neighbours share as fields [m], with that of the rest positions; None for none."""
         fields, _ = noise.fields(rest, seen)
-        return fields * np.sqrt(1 + self._rest_variance / self._still_sd**2)[:, np.newaxis] if fields.shape[1] else None
+        with_rest = fields * np.sqrt(1 + self._rest_variance / self._still_sd**2)[:, np.newaxis]
+        return jnp.asarray(with_rest) if fields.shape[1] else None
+
+    @property
+    def fields(self) -> Float[Array, "n modes"] | None:
+        """Return the noise that neighbours share, as `Track.fields` has it; see `start`."""
+        return self._fields
 
     def track(self, points: MeasuredPoints) -> Track:
         """Return the particles of one frame, with the error of the rest positions in their covariance."""

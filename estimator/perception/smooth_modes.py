@@ -1,14 +1,14 @@
 """The largest modes of a smooth field over points.
 
-With the covariance K_ij = exp(-|a_i - a_j|^2 / 2 length^2), an orthonormal Q that roughly spans the largest eigenvectors
-and B = K Q,
+With the covariance K_ij = exp(-|a_i - a_j|^2 / 2 length^2), an orthonormal Q that roughly spans the largest
+eigenvectors, and B = K Q,
 
     B (Q^T B)^-1 B^T = V Lambda V^T
 
 is the Nystroem approximation of K. It is never above K, so what the modes lack is a covariance too, and it is exact
-where Q spans the eigenvectors [Tropp, Yurtsever, Udell, Cevher 2017, doi:10.1137/17M1111590]. Q is interpolated from
-the eigenvectors of few landmarks, each weighted by the number of points near it; B holds the kernel of all points, which
-is made in blocks of rows. So n points take O(n^2) time and O(n) memory.
+where Q spans the eigenvectors [Tropp, Yurtsever, Udell, Cevher 2017, doi:10.1137/17M1111590]. The first Q is
+interpolated from the eigenvectors of few landmarks, each weighted by the number of points near it; every further one
+is V. B takes the kernel of all points, made in blocks of rows: n points take O(n^2) time and O(n) memory.
 """
 
 import numpy as np

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from jiggle_mj.errors import PerceptionError
 
@@ -24,9 +24,9 @@ class Track:
     """Covariance of each position [m^2]; `UNSEEN_VARIANCE` on the diagonal where unseen."""
     visible: Bool[np.ndarray, " n"]
     """Which particles are seen."""
-    fields: Float[np.ndarray, "n modes"] | None = None
+    fields: Float[Array, "n modes"] | None = None
     """The part of the noise that neighbours share, as fields of unit amplitude, the same for each coordinate [m]; the
-    covariance holds it too. None where none is known."""
+    covariance holds it too. One array serves all frames of a recording. None where none is known."""
     uvd: Float[np.ndarray, "n 3"] | None = None
     """Left rectified pixel and disparity [px], an estimate where unseen; None without images."""
 
@@ -40,6 +40,15 @@ class Track:
     def precision(self) -> Float[np.ndarray, "n 3 3"]:
         """Return the inverse covariances, 0 where unseen [1/m^2]."""
         return np.where(self.visible[:, None, None], np.linalg.inv(self.covariance), 0.0)
+
+    @cached_property
+    def white_precision(self) -> Float[np.ndarray, "n 3 3"]:
+        """Return the inverse covariances without the noise that neighbours share, 0 where unseen [1/m^2]."""
+        if self.fields is None:
+            return self.precision
+        shared = np.sum(np.asarray(self.fields) ** 2, axis=1)[:, None, None] * np.eye(3)
+        shared = np.where(self.visible[:, None, None], shared, 0.0)
+        return np.where(self.visible[:, None, None], np.linalg.inv(self.covariance - shared), 0.0)
 
     def __post_init__(self) -> None:
         """Check that the covariances are symmetric and positive definite."""

@@ -90,13 +90,15 @@ class PullPredictor(eqx.Module):
     balance: ForceBalance
     belief: AttachmentBelief
     point_precision: Float[Array, "3 3"]
-    """Inverse covariance of an observed particle's position [1/m^2]."""
+    """Inverse covariance of an observed particle's position, without the noise that neighbours share [1/m^2]."""
     about: Bool[Array, " n"]
     """Particles whose s is asked about."""
     mixture: Mixture
     """Marginal of each particle's s under the belief."""
     variance: Float[Array, " n"]
     """Variance of each s under the belief's Gaussian."""
+    shared_noise: Float[Array, "n modes"] | None
+    """See `Evidence.fields`."""
 
     @classmethod
     def build(
@@ -105,14 +107,16 @@ class PullPredictor(eqx.Module):
         belief: AttachmentBelief,
         point_precision: Float[Array, "3 3"],
         about: Bool[Array, " n"],
+        shared_noise: Float[Array, "n modes"] | None = None,
     ) -> "PullPredictor":
         """Return a predictor, with what does not depend on the pull computed once.
 
         Args:
             balance: the sheet's force balance.
             belief: about the attachments.
-            point_precision: inverse covariance of an observed particle's position [1/m^2].
+            point_precision: inverse covariance of an observed particle's position, without shared noise [1/m^2].
             about: particles whose s is asked about.
+            shared_noise: see `Evidence.fields`.
         """
         mixture, gaussian = _mixture_and_gaussian(belief)
         return cls(
@@ -122,6 +126,7 @@ class PullPredictor(eqx.Module):
             about=about,
             mixture=mixture,
             variance=gaussian.variance,
+            shared_noise=shared_noise,
         )
 
     @classmethod
@@ -137,7 +142,9 @@ class PullPredictor(eqx.Module):
         """
         balance, belief = estimator.balance, estimator.attachment_belief
         asked = jnp.ones(len(belief.shift), dtype=bool) if about is None else jnp.asarray(about)
-        return cls.build(balance, belief, jnp.asarray(estimator.point_precision), asked)
+        shared = estimator.shared_noise
+        shared = None if shared is None else jnp.asarray(shared)
+        return cls.build(balance, belief, jnp.asarray(estimator.point_precision), asked, shared)
 
     def scenarios(self, key: PRNGKeyArray, count: int, *, unknown: float | Array) -> Float[Array, "count n"]:
         """Draw scenarios of s: first each particle's stiffness component by itself, then all s jointly given those.
@@ -209,8 +216,12 @@ class PullPredictor(eqx.Module):
 
     def _evidence(self, candidate: CandidatePull, y: Float[Array, "n 3"]) -> Evidence:
         """Return the evidence of a frame in which all particles are observed at y."""
-        precision = jnp.broadcast_to(self.point_precision[None], (len(y), 3, 3))
-        return Evidence(y=y, precision=precision, held=candidate.held, force_unknown=candidate.force_unknown)
+        precision, fields = jnp.broadcast_to(self.point_precision[None], (len(y), 3, 3)), self.shared_noise
+        if fields is not None:
+            shared = jnp.where(candidate.held, 0.0, jnp.sum(fields**2, axis=1))[:, None, None]
+            precision = jnp.linalg.inv(jnp.linalg.inv(precision) + shared * jnp.eye(3)[None])
+        unknown = candidate.force_unknown
+        return Evidence(y=y, precision=precision, held=candidate.held, force_unknown=unknown, fields=fields)
 
 
 @eqx.filter_jit

@@ -239,7 +239,7 @@ def sharing(evidence: Evidence) -> Evidence:
     """Return the evidence with more noise, which neighbours share."""
     shown = np.where(np.asarray(evidence.seen & ~evidence.held)[:, None], fields(), 0.0)
     covariance = np.linalg.inv(evidence.precision) + np.sum(shown**2, axis=1)[:, None, None] * np.eye(3)
-    return replace(evidence, precision=jnp.asarray(np.linalg.inv(covariance)), fields=jnp.asarray(shown))
+    return replace(evidence, precision=jnp.asarray(np.linalg.inv(covariance)), fields=jnp.asarray(fields()))
 
 
 def observed(frame: Lift, seed: int, unseen: np.ndarray | None = None) -> Evidence:

@@ -80,7 +80,7 @@ def test_information_equals_the_dense_formula(balance, shared):
         )
         D[3 * i : 3 * i + 3, i] = K * d[i] - internal[i]
     if seen.fields is not None:
-        R += np.kron(seen.fields @ seen.fields.T, np.eye(3))
+        R += np.kron(seen.seen_fields @ seen.seen_fields.T, np.eye(3))
     flow = np.zeros(N)
     for term in sheet_energy().terms:
         forces = np.asarray(eqx.filter_jit(term.gradient)(jnp.asarray(x[np.asarray(term.vertices)])))
@@ -151,7 +151,7 @@ def test_steps_end_where_the_cost_has_no_slope(balance):
     R = np.zeros((3 * N, 3 * N))
     for i, precision in enumerate(np.asarray(white.precision)):
         R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = np.linalg.inv(precision)
-    shared = np.asarray(seen.fields)
+    shared = np.asarray(seen.seen_fields)
     R += np.kron(shared @ shared.T, np.eye(3))
     by_seen = np.linalg.solve(R, np.asarray(seen.y - frame.x).ravel())
     by_force = eqx.filter_jit(jax.grad(lambda x: 0.5 * jnp.sum(frame.weight[:, None] * balance.unbalanced(x, s) ** 2)))(

@@ -112,7 +112,7 @@ def test_noise_that_neighbours_share_leaves_errors_as_large_as_claimed():
         for k, frame in enumerate(lifts()):
             one = sharing(observed(frame, 100 * seed + k))
             assert one.fields is not None
-            seen.append(replace(one, y=one.y + one.fields @ draw.normal(size=(one.fields.shape[1], 3))))
+            seen.append(replace(one, y=one.y + one.seen_fields @ draw.normal(size=(one.fields.shape[1], 3))))
         for counted, errors in found.items():
             evidence = seen if counted else [one.without_fields() for one in seen]
             errors.append(nees(follow(implicit(), lifts(), evidence)[2].belief))

@@ -34,7 +34,7 @@ def drawn(request: pytest.FixtureRequest) -> list[ForceResiduals]:
         seen_sd = 1 / jnp.sqrt(seen.white_precision[:, 0, 0])
         parts = sd[:, None] * own, seen_sd[:, None] * others
         if seen.fields is not None:
-            parts = parts[0], parts[1] + seen.fields @ smooth
+            parts = parts[0], parts[1] + seen.seen_fields @ smooth
         off_balance = eqx.tree_at(lambda one: (one.unbalanced, one.innovation), frame, parts)
         return balance.residuals(off_balance, balance.fit(off_balance), seen)
 

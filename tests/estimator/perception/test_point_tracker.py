@@ -81,6 +81,7 @@ def test_noise_that_neighbours_share_is_found_in_still_frames():
     tracker.start([points(rest + own + root @ shared) for own, shared in zip(white, smooth, strict=True)])
     track = tracker.track(points(rest))
     assert track.fields is not None
+    assert tracker.track(points(rest)).fields is track.fields  # one array for all frames
     share = np.sum(track.fields**2, axis=1) / track.covariance[:, 0, 0]
     assert np.mean(share) == pytest.approx(0.5, abs=0.1)  # of few independent values in 20 frames
     assert track.covariance[:, 0, 0].mean() == pytest.approx(SD**2 * (1 + 1 / 20), rel=2 * SAMPLING)
@@ -111,7 +112,7 @@ def test_vertices_that_nothing_measures_have_no_shared_noise_and_do_not_change_t
     root = vectors * np.sqrt(np.maximum(values, 0))
     white, smooth = draw.normal(size=(2, 20, sheet().n, 3)) * SD / np.sqrt(2)
     still = [points(rest + own + root @ shared) for own, shared in zip(white, smooth, strict=True)]
-    beyond = rest + [2 * np.ptp(rest[:, 0]), 0.0, 0.0]
+    beyond = rest + np.array([2 * np.ptp(rest[:, 0]), 0.0, 0.0])
     ids = np.arange(sheet().n)
     fields = []
     for vertices, faces, track_id in (

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from jiggle_mj.estimator.belief.spike_and_slab import Mixture
+from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.planning.outcomes import outcomes, outcomes_in_batches
 from jiggle_mj.estimator.planning.plan_safety import observed_energy_ratio
 from jiggle_mj.estimator.planning.pull_predictor import CandidatePull, PullPredictor, expected_fall
-from tests.support.small_sheet import GRIP_RADIUS, NOISE, attached, corners, sheet, sheet_balance, sheet_prior
+from tests.support.small_sheet import GRIP_RADIUS, NOISE, attached, corners, fields, sheet, sheet_balance, sheet_prior
 
 POINT_PRECISION = jnp.eye(3) / NOISE**2
 KNOWN = 0.09
@@ -27,6 +28,8 @@ FALL_ERROR = 0.05
 N_SCENARIOS = 200
 SHARE_ERROR = 0.12
 """Three and a half standard errors of a share near 1/2 in `N_SCENARIOS`."""
+ROUNDING = 1e-6
+"""Relative difference of a covariance that is inverted twice."""
 MEAN_ERROR = 0.01
 """Error of the mean of s in `N_SCENARIOS` of a standard deviation of 0.005, and how far the prior moves it."""
 
@@ -163,3 +166,28 @@ def compare_on_all_devices() -> None:
 
 if __name__ == "__main__":
     compare_on_all_devices()
+
+
+def test_the_predicted_gain_counts_noise_that_neighbours_share(predictor):
+    """It is the gain of the frame's own information with the same noise in it.
+
+    Noise as smooth as this one bends the sheet less than white noise of the same size, and so hides less.
+    """
+    shared, pull, s = jnp.asarray(fields()), lift(5e-3), jnp.where(attached(), KNOWN, 0.0)
+    x = jnp.asarray(predictor.equilibrium(pull, s).x)
+    counted = eqx.tree_at(lambda one: one.shared_noise, predictor, shared, is_leaf=lambda leaf: leaf is None)
+    total = NOISE**2 + np.where(pull.held, 0.0, np.sum(np.asarray(shared) ** 2, axis=1))
+    seen = Evidence(
+        y=x,
+        precision=jnp.asarray(np.eye(3) / total[:, None, None]),
+        held=pull.held,
+        force_unknown=pull.force_unknown,
+        fields=shared,
+    )
+
+    def gain(evidence: Evidence) -> float:
+        frame = predictor.balance.linearise(x, s, evidence)
+        return float(predictor.gain(predictor.balance.information(frame, predictor.balance.fit(frame)).precision))
+
+    assert float(counted.gain_at(pull, s, x)) == pytest.approx(gain(seen), rel=ROUNDING)
+    assert gain(seen) > gain(seen.without_fields())
