@@ -17,7 +17,7 @@ from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.argument_checks import as_array, as_instance
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import ObservationError, PerceptionError
-from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.estimate import Belief, Detection, Estimate, PointNoise, Sheet
 from jiggle_mj.material import Material, material
 from jiggle_mj.observation import Declaration, Observation, ToolState
 
@@ -71,12 +71,11 @@ class Estimator:
         self._perception = Perception(
             declaration, camera, spacing=config.spacing, config=config.perception, mask=mask, disparity=disparity
         )
-        self._grip = GripTracker()
         self._tracked_or_none: TrackedSheet | None = None
         self._open_frame: Observation | None = None
         self._tool: ToolState | None = None
         self._seen_precision = np.eye(3) * INITIAL_POINT_SD**-2
-        self._slip, self._has_estimate = 0.0, False
+        self._grip, self._slip, self._has_estimate = GripTracker(), 0.0, False
 
     def update(self, observation: Observation) -> Estimate | None:
         """Take one observation; return None if it only helps to fix the rest shape, or cannot be used.
@@ -268,9 +267,7 @@ class Estimator:
 
     @property
     def point_precision(self) -> Float[np.ndarray, "3 3"]:
-        """Mean inverse covariance of a seen particle in the latest frame, with the learned noise [1/m^2].
-
-        It is without the noise that neighbours share, which `shared_noise` holds.
+        """Mean inverse covariance of a particle in the latest frame, as learned, without `shared_noise` [1/m^2].
 
         Raises:
             ValueError: asked before `begin`.
@@ -286,6 +283,11 @@ class Estimator:
         """
         fields, variance = self._perception.fields, self._tracked.position_variance
         return None if fields is None else np.asarray(fields) * np.sqrt(variance)
+
+    @property
+    def point_noise(self) -> PointNoise | None:
+        """The noise of measured points that counts; None for images, and before there is a sheet."""
+        return self._perception.noise
 
     @property
     def sheet(self) -> Sheet:

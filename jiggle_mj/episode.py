@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from .actions import Action
 from .errors import ActionError, OutputError, PerceptionError
-from .estimate import Belief, Detection, Estimate, Sheet
+from .estimate import Belief, Detection, Estimate, PointNoise, Sheet
 from .observation import Observation
 from .recording.declaration import identity
 from .recording.estimate import EstimateWriter
@@ -57,6 +57,8 @@ class Episode:
     """Number of frames of the source, including those with open jaws and the skipped ones."""
     skipped: tuple[tuple[int, str], ...]
     """Index and reason of each frame that the recording or the estimator could not use."""
+    point_noise: PointNoise | None = None
+    """Noise of measured points that the estimator counted with; None for images."""
 
 
 class Stopwatch:
@@ -269,4 +271,5 @@ def estimate(
         prior_entropy=estimator.prior_entropy,
         n_frames=n_frames + len(unreadable),
         skipped=skipped,
+        point_noise=estimator.point_noise,
     )

@@ -1,6 +1,8 @@
 """Results of the estimator: one `Estimate` per frame over a fixed set of particles, and the final belief."""
 
+import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,6 +16,29 @@ class Sheet:
     """Rest positions of the particles [m]."""
     faces: Int[np.ndarray, "f 3"]
     """Particle numbers of each triangle, from 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointNoise:
+    """The noise of a coordinate of a measured point that the estimator counts with."""
+
+    sd: float
+    """Standard deviation of the part that is independent from point to point [m]."""
+    smooth_sd: float
+    """Standard deviation of the part that neighbours share [m]; 0 for none."""
+    smooth_length: float | None
+    """Distance at rest over which that part correlates by exp(-1/2) [m]; None for none."""
+    source: Literal["stated", "measured", "assumed"]
+    """Whether the recording states it, frames at rest show more than it states, or nothing is known."""
+    stated_sd: float | None
+    """Standard deviation of both parts together as the recording states it [m]; None where it states none."""
+    still_frames: int
+    """Frames at rest from which it is measured; 0 where it is not."""
+
+    @property
+    def total_sd(self) -> float:
+        """Return the standard deviation of both parts together [m]."""
+        return math.hypot(self.sd, self.smooth_sd)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -64,7 +64,7 @@ class MeasuredPoints:
 
     Raises:
         ObservationError: positions are no numbers of shape (m, 3), there is not one track id for each, an id of 0 or
-            above repeats, or the standard deviation is not finite and above 0.
+            above repeats, or the noise is not what a noise can be.
     """
 
     positions: Float[np.ndarray, "m 3"]
@@ -74,6 +74,12 @@ class MeasuredPoints:
     without correspondence."""
     sd: float = 2e-4
     """Standard deviation of each coordinate's noise [m]."""
+    sd_stated: bool = True
+    """Whether somebody states `sd`; False where it is the default for want of a statement."""
+    smooth_sd: float = 0.0
+    """Standard deviation of the part of `sd` that neighbours share [m]; 0 where none is stated."""
+    smooth_length: float | None = None
+    """Distance at rest over which that part correlates by exp(-1/2) [m]; needed with `smooth_sd`."""
 
     def __post_init__(self) -> None:
         """Check positions, identities and noise."""
@@ -83,7 +89,18 @@ class MeasuredPoints:
             self,
             positions=positions,
             sd=as_number(self.sd, f"{name}.sd", unit="m", above=0, error=ObservationError),
+            smooth_sd=as_number(self.smooth_sd, f"{name}.smooth_sd", unit="m", at_least=0, error=ObservationError),
         )
+        if not self.smooth_sd < self.sd:
+            raise ObservationError(
+                f"{name}.smooth_sd is {self.smooth_sd:g} m, and sd, of which it is a part, {self.sd:g} m; give sd with "
+                "the noise of single points in it."
+            )
+        if self.smooth_length is not None:
+            length = as_number(self.smooth_length, f"{name}.smooth_length", unit="m", above=0, error=ObservationError)
+            store(self, smooth_length=length)
+        elif self.smooth_sd:
+            raise ObservationError(f"{name}.smooth_sd needs a smooth_length, over which neighbours share it [m].")
         if self.track_id is not None:
             store(self, track_id=_track_ids(self.track_id, f"{name}.track_id", len(positions)))
 

@@ -72,7 +72,7 @@ def collect_dataset(
         PerceptionError: no frame with closed jaws could be used.
     """
     config = replace(config or EstimatorConfig(), refinement="end")
-    estimator, frames, stated_sd = Estimator(declaration, camera, config=config, mask=mask), [], ASSUMED_SD
+    estimator, frames, noise = Estimator(declaration, camera, config=config, mask=mask), [], assumed(ASSUMED_SD)
     still: list[MeasuredPoints] = []
     resting: dict[int, list[MeasuredPoints]] = {}
     grasp, closed = -1, 0
@@ -80,7 +80,7 @@ def collect_dataset(
         found = estimator.update(observation)
         on_frame(observation, found)
         if observation.points is not None:
-            stated_sd = observation.points.sd
+            noise = stated(observation.points)
         if found is None:
             if not frames and observation.points is not None:
                 still.append(observation.points)
@@ -93,7 +93,7 @@ def collect_dataset(
     if not frames:
         raise PerceptionError("no frame with closed jaws could be used, so there is nothing to fit effects to.")
     estimator.release()
-    noise = _noise_of([still], estimator) or _noise_of(list(resting.values()), estimator) or assumed(stated_sd)
+    noise = _noise_of([still], estimator) or _noise_of(list(resting.values()), estimator) or noise
     measured = None if estimator.track_ids is None else estimator.track_ids >= 0
     fields, sd = noise.fields(estimator.sheet.rest, measured)
     mistaken = another_shape(frames, sd, fields)
@@ -110,6 +110,14 @@ def collect_dataset(
 def assumed(sd: float) -> StillNoise:
     """Return the noise assumed where there are too few still frames: the stated sd [m], and as much smooth noise."""
     return StillNoise(sd=sd, smooth_sd=sd, length=ASSUMED_LENGTH, frames=0)
+
+
+def stated(points: MeasuredPoints) -> StillNoise:
+    """Return the noise that points state; where they state no smooth noise, as much of it as of all is assumed."""
+    if points.smooth_length is None:
+        return assumed(points.sd)
+    white = np.sqrt(points.sd**2 - points.smooth_sd**2)
+    return StillNoise(sd=float(white), smooth_sd=points.smooth_sd, length=points.smooth_length, frames=0)
 
 
 def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, closed: int) -> Timed:

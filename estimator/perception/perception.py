@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jiggle_mj.argument_checks import as_function, as_instance
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import MaskError, PerceptionError
-from jiggle_mj.estimate import Sheet
+from jiggle_mj.estimate import PointNoise, Sheet
 from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, StereoPair, ToolState
 
 from ..physics.environment import Grip
@@ -19,6 +19,7 @@ from ..ranges import refuse_many_particles
 from .cloud_tracker import CloudTracker, lay_mesh
 from .config import PerceptionConfig
 from .disparity import Disparity
+from .point_noise import CombinedNoise
 from .point_tracker import MESH_CAUSE, PointTracker
 from .stereo_tracker import StereoTracker
 from .tissue_mask import FrameMask, TissueMask
@@ -99,6 +100,14 @@ class Perception:
     def fields(self) -> Float[Array, "n modes"] | None:
         """Return the noise that neighbours share, as `Track.fields` has it; None where none is known."""
         return self._points.fields
+
+    @property
+    def noise(self) -> PointNoise | None:
+        """Return the noise of measured points, once there is a sheet; None for images."""
+        if self._sheet is None or not self._still:
+            return None
+        combined = self._points.noise
+        return (CombinedNoise.of(self._still[0], None) if combined is None else combined).published
 
     def look_at_rest(self, observation: Observation) -> str | None:
         """Use a frame before the first grasp, and return None, or why it is skipped.

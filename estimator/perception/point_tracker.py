@@ -18,6 +18,7 @@ from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
 
 from ..ranges import refuse_many_particles
 from .config import PointTrackerConfig
+from .point_noise import CombinedNoise
 from .robust import usual
 from .still_noise import StillNoise, measure
 from .track import UNSEEN_VARIANCE, Track
@@ -33,6 +34,8 @@ class PointTracker:
         self._declared, self._config = mesh, config or PointTrackerConfig()
         self.ids = np.empty(0, dtype=np.int64)
         """Track id of each particle, -1 where nothing is measured."""
+        self.noise: CombinedNoise | None = None
+        """Noise of the points, once there is a sheet."""
         self._fields: Float[Array, "n modes"] | None = None
 
     def start(self, still: list[MeasuredPoints]) -> Sheet:
@@ -76,10 +79,11 @@ class PointTracker:
         self._rest_variance: Float[np.ndarray, " n"] = rest_variance
         self._still_sd = still[0].sd
         positions = np.array([_positions(frame, self.ids) for frame in frames])
-        noise = measure([positions], sheet.rest)
         seen = np.isfinite(positions).all(axis=2).any(axis=0)
-        self._fields = None if noise is None else self._shared(noise, sheet.rest, seen)
-        self._measured_sd = 0.0 if noise is None or self._fields is None else noise.total_sd
+        self.noise = CombinedNoise.of(still[0], measure([positions], sheet.rest))
+        self._fields = self._shared(self.noise.noise, sheet.rest, seen)
+        counts = self.noise.measured or self._fields is not None
+        self._least_sd = self.noise.noise.total_sd if counts else 0.0
         return sheet
 
     def _shared(
@@ -99,8 +103,8 @@ class PointTracker:
         """Return the particles of one frame, with the error of the rest positions in their covariance."""
         positions = _positions(_by_id(points), self.ids)
         visible = np.asarray(np.isfinite(positions).all(axis=1))
-        rest = max(1.0, self._measured_sd / self._still_sd) ** 2 * self._rest_variance
-        variance = np.where(visible, max(points.sd, self._measured_sd) ** 2 + rest, UNSEEN_VARIANCE)
+        rest = max(1.0, self._least_sd / self._still_sd) ** 2 * self._rest_variance
+        variance = np.where(visible, max(points.sd, self._least_sd) ** 2 + rest, UNSEEN_VARIANCE)
         return Track(
             positions=positions,
             covariance=variance[:, None, None] * np.eye(3),

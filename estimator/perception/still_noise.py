@@ -8,6 +8,7 @@ the same for each coordinate. It is measured from differences of consecutive fra
 count; and never from the residual of a fit, which holds the effects that are searched for.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,7 +122,8 @@ def measure(
         amplitude = amplitude if amplitude > SIGNIFICANT * error else 0.0
         best = min(best, (float(np.sum((covariance - amplitude * kernel) ** 2)), amplitude, float(length)))
     smooth = min(best[1], MAX_SMOOTH_SHARE * total)
-    return StillNoise(sd=np.sqrt(total - smooth), smooth_sd=np.sqrt(smooth), length=best[2], frames=frames)
+    white, smooth = math.sqrt(total - smooth), math.sqrt(smooth)
+    return StillNoise(sd=white, smooth_sd=smooth, length=best[2], frames=frames)
 
 
 def _pairs(n: int, seed: int) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:

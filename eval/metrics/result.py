@@ -16,7 +16,7 @@ from jaxtyping import Bool
 from jiggle_mj.argument_checks import as_path
 from jiggle_mj.episode import Episode
 from jiggle_mj.errors import RecordingError
-from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.estimate import Belief, Detection, Estimate, PointNoise, Sheet
 from jiggle_mj.limits import Limits
 from jiggle_mj.recording.estimate import EstimateRecording
 from jiggle_mj.truth import Truth
@@ -93,7 +93,11 @@ def result(run: Run) -> Json:
             "observable": {"by_dilation": {str(rings): dict(NO_AGREEMENT) for rings in DILATIONS}},
             "converged": detection.converged,
         },
-        "noise": {"force_sd_ratio": detection.force_sd_ratio, "position_sd_ratio": detection.position_sd_ratio},
+        "noise": {
+            "force_sd_ratio": detection.force_sd_ratio,
+            "position_sd_ratio": detection.position_sd_ratio,
+            "points": _point_noise(episode.point_noise),
+        },
         "calibration": dict.fromkeys(field.name for field in fields(Calibration)),
         "tracking": {"rms_m": None},
         "safety": {
@@ -205,6 +209,20 @@ def agreements(
         figures = agreement(detected, transferred.attached, sheet.faces, rings, observable=observable)
         by_dilation[str(rings)] = {"pcd": figures.pcd, "pug": figures.pug, "f1": figures.f1}
     return by_dilation
+
+
+def _point_noise(noise: PointNoise | None) -> Json | None:
+    """Return the noise of measured points that counted; None for images."""
+    if noise is None:
+        return None
+    return {
+        "from": noise.source,
+        "point_sd_m": noise.sd,
+        "smooth_sd_m": noise.smooth_sd,
+        "smooth_length_m": noise.smooth_length,
+        "stated_sd_m": noise.stated_sd,
+        "still_frames": noise.still_frames,
+    }
 
 
 def _safety(limits: Json, truth: Truth) -> Json:

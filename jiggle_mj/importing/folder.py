@@ -134,7 +134,13 @@ def import_folder(
                         time=time,
                         tool=tool.state(number, positions),
                         reports=tool.reported(previous_time, time),
-                        points=MeasuredPoints(positions=positions, track_id=np.arange(len(rest)), sd=given.noise_sd),
+                        points=MeasuredPoints(
+                            positions=positions,
+                            track_id=np.arange(len(rest)),
+                            sd=given.noise_sd,
+                            smooth_sd=given.smooth_sd,
+                            smooth_length=given.smooth_length,
+                        ),
                     )
                 )
                 n_frames, n_unseen, previous_time = n_frames + 1, n_unseen + int(unseen.sum()), time

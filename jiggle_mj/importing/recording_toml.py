@@ -5,6 +5,7 @@ data files, whose unit the description gives.
 """
 
 import json
+import math
 import os
 import tomllib
 from collections.abc import Callable
@@ -102,6 +103,10 @@ class MeasuredRecording:
     """Nanoseconds in one unit of the frames' times; None where it is not given, which means seconds."""
     noise_sd: float
     """Standard deviation of each coordinate's noise [m]."""
+    smooth_sd: float
+    """Standard deviation of the part of it that neighbours share [m]; 0 for none."""
+    smooth_length: float | None
+    """Distance over which they share it [m]; None for none."""
     points: PointFiles
     """The files of the tracked points."""
     frame: WorldFrame
@@ -144,12 +149,30 @@ def read_recording_toml(path: Path) -> MeasuredRecording:
     return _recording(top)
 
 
+def _noise(top: StrictTable) -> tuple[float, float, float | None]:
+    """Return the noise of a coordinate, the part of it that neighbours share, and over which distance [m]."""
+    if "point_sd" not in top.values:
+        for key in ("smooth_sd", "smooth_length"):
+            if key in top.values:
+                raise RecordingError(
+                    f"{top.where}: {key} needs point_sd, the noise that is independent from point to point, in place "
+                    "of noise_sd, which is all noise together."
+                )
+        return top.take("noise_sd", kinds.positive), 0.0, None
+    if "noise_sd" in top.values:
+        raise RecordingError(f"{top.where}: noise_sd is all noise together, and point_sd a part of it; give one.")
+    point_sd, smooth_sd = top.take("point_sd", kinds.positive), top.take("smooth_sd", kinds.not_negative, 0.0)
+    length = top.take("smooth_length", kinds.positive) if smooth_sd else top.take("smooth_length", kinds.positive, None)
+    return math.hypot(point_sd, smooth_sd), smooth_sd, length
+
+
 def _recording(top: StrictTable) -> MeasuredRecording:
     unit = unit_of(top, "unit", LENGTH_UNITS)
     mesh, truth = top.table("mesh", optional=True), top.table("truth", optional=True)
     extend = mesh.table("extend", optional=True)
     points = read_points_table(top.table("points"))
     faces = mesh.take("faces", kinds.text, "none")
+    noise_sd, smooth_sd, smooth_length = _noise(top)
     recording = MeasuredRecording(
         name=top.take("name", kinds.text),
         source=top.take("source", kinds.text, ""),
@@ -157,7 +180,9 @@ def _recording(top: StrictTable) -> MeasuredRecording:
         unit_name=top.values["unit"],
         period=None if points.times is not None and "period" not in top.values else _period(top),
         time_unit=unit_of(top, "time_unit", TIME_UNITS) if "time_unit" in top.values else None,
-        noise_sd=top.take("noise_sd", kinds.positive),
+        noise_sd=noise_sd,
+        smooth_sd=smooth_sd,
+        smooth_length=smooth_length,
         points=points,
         frame=_frame(top.table("frame", optional=True)),
         faces=None if faces == "none" else faces,

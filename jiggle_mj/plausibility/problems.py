@@ -12,6 +12,8 @@ from .survey import Survey
 from .tool_fits import APART
 from .tool_problems import NOISE_MULTIPLES
 
+MAX_NOISE_RATIO = 2.0
+"""Largest ratio of the measured to the declared noise that is no doubt yet."""
 REFUSED_EXTENT_M, DOUBTED_EXTENT_M = (1e-3, 10.0), (5e-3, 2.0)
 """Extent of the sheet [m]: outside the first it is refused, outside the second doubted. A corneal flap is 8 mm wide, a
 bed sheet 2 m; between metres and millimetres lies a factor of 1000."""
@@ -236,11 +238,11 @@ def _noise(survey: Survey) -> Iterator[RecordingProblem]:
     declared, measured = survey.declared_sd_m, survey.noise_sd_m
     if declared is None or measured is None or survey.sensing != "points":
         return
-    if measured > NOISE_MULTIPLES * declared:
+    if measured > MAX_NOISE_RATIO * declared:
         yield _warn(
             "noise",
             f"the noise is declared as {metres(declared)} and measured as {metres(measured)} ({survey.noise_from}); "
-            "the estimate would be too sure: set noise_sd to what is measured.",
+            "the larger one counts where still frames show it: set noise_sd to what is measured.",
         )
     elif survey.noise_from == "still frames" and declared > NOISE_MULTIPLES * measured > 0:  # 0: rounded, or none
         yield _warn(

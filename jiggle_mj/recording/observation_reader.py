@@ -103,13 +103,12 @@ class ObservationReader:
         _refuse_span(positions)
         if not np.array_equal(T, np.eye(4)):
             positions = positions @ T[:3, :3].T + T[:3, 3]
-        known = {}
-        if "sd" in columns and len(positions):
-            known["sd"] = _common_sd(columns.numbers("sd", (None,)))
+        stated = ("sd", "smooth_sd", "smooth_length") if len(positions) else ()
+        known = {name: _common(columns.numbers(name, (None,)), name) for name in stated if name in columns}
         track = None
         if "track_id" in columns:
             track = columns.indices("track_id", (None,), from_=-MAX_COUNT, below=MAX_COUNT)
-        return MeasuredPoints(positions=positions, track_id=track, **known)
+        return MeasuredPoints(positions=positions, track_id=track, sd_stated="sd" in known, **known)
 
     def _T_world_tip(self, pose: PoseInFrame) -> Float[np.ndarray, "4 4"]:
         return self.contents.frames.T_world(pose.frame_id, POSE) @ parse_transform(pose.pose)
@@ -143,14 +142,14 @@ def _refuse_span(positions: Float[np.ndarray, "m 3"]) -> None:
         )
 
 
-def _common_sd(sd: Float[np.ndarray, " m"]) -> float:
-    """Return the standard deviation that all points of a cloud share [m]; refuse two different ones."""
-    finite = sd[np.isfinite(sd)]
+def _common(lengths: Float[np.ndarray, " m"], name: str) -> float:
+    """Return the number that all points of a cloud share, of their noise [m]; refuse two different ones."""
+    finite = lengths[np.isfinite(lengths)]
     low, high = (finite.min(), finite.max()) if len(finite) else (np.nan, np.nan)
     if high > low * (1 + EQUAL_SD):
-        raise RecordingError(f"{POINTS} has sd from {low:g} to {high:g} m; all points of a cloud must share one.")
+        raise RecordingError(f"{POINTS} has {name} from {low:g} to {high:g} m; all points of a cloud must share one.")
     if low > MAX_SD_M:
         raise RecordingError(
-            f"{POINTS} has an sd of {low:g} m; at most {MAX_SD_M:g} m are read (is it in millimetres?)"
+            f"{POINTS} has an {name} of {low:g} m; at most {MAX_SD_M:g} m are read (is it in millimetres?)"
         )
     return float(low)

@@ -115,5 +115,8 @@ def _points_message(time: int, points: MeasuredPoints) -> PointCloud:
     columns: dict[str, np.ndarray] = dict(zip("xyz", np.asarray(points.positions, float).T, strict=True))
     if points.track_id is not None:
         columns["track_id"] = points.track_id
-    columns["sd"] = np.full(len(points.positions), points.sd)
+    stated = {"sd": points.sd} if points.sd_stated else {}
+    if points.smooth_sd and points.smooth_length is not None:
+        stated |= {"smooth_sd": points.smooth_sd, "smooth_length": points.smooth_length}
+    columns |= {name: np.full(len(points.positions), value) for name, value in stated.items()}
     return point_cloud(time, columns)

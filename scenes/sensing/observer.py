@@ -215,6 +215,7 @@ class Observer:
             tracked=not cloud,
             smooth=smooth,
             smooth_sd=settings.smooth_sd,
+            smooth_length=settings.smooth_length,
         )
 
     def _misplaced(self, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:

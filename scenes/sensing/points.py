@@ -93,15 +93,22 @@ def add_point_noise(
     tracked: bool,
     smooth: Float[np.ndarray, "m 3"] | None = None,
     smooth_sd: float = 0.0,
+    smooth_length: float | None = None,
 ) -> MeasuredPoints:
     """Return measured points: positions plus white noise of standard deviation `sd` [m] plus the given smooth noise.
 
-    The result states the standard deviation of both noises together.
+    The result states the standard deviation of both noises together, and of the smooth one with its range [m].
     """
     noisy = positions + sd * rng.standard_normal(positions.shape)
     noisy = noisy if smooth is None else noisy + smooth
     total_sd = float(np.hypot(sd, smooth_sd))
-    return MeasuredPoints(positions=noisy, track_id=np.arange(len(positions)) if tracked else None, sd=total_sd)
+    return MeasuredPoints(
+        positions=noisy,
+        track_id=np.arange(len(positions)) if tracked else None,
+        sd=total_sd,
+        smooth_sd=smooth_sd,
+        smooth_length=smooth_length if smooth_sd else None,
+    )
 
 
 def smooth_factor(sheet: Triangulation, *, sd: float, length: float) -> Float[np.ndarray, "n n"]:

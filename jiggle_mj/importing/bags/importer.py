@@ -219,7 +219,7 @@ def _points(prepared: Preparation, stamp: int, read: dict[Role, Any]) -> Measure
     if not np.array_equal(T, np.eye(4)):
         positions = positions @ T[:3, :3].T + T[:3, 3]
     known = {} if prepared.settings.noise_sd is None else {"sd": prepared.settings.noise_sd}
-    return MeasuredPoints(positions=positions, track_id=track, **known)
+    return MeasuredPoints(positions=positions, track_id=track, sd_stated=bool(known), **known)
 
 
 def _scene_seen(bag: Bag, prepared: Preparation, notes: list[str]) -> tuple[float, float] | None:

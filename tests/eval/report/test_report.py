@@ -239,6 +239,10 @@ def test_doubts_are_listed_where_there_are_any(tmp_path):
     assert doubts(good) == doubts({"detection": {}}) == []
     rest, forces = doubts(bad)
     assert "halves of the samples disagree" in rest and "forces are off by 12.0 times" in forces
+    noisy = {"from": "measured", "point_sd_m": 3e-4, "smooth_sd_m": 4e-4, "stated_sd_m": 2e-4}
+    (shown,) = doubts({"detection": {}, "noise": {"points": noisy}})
+    assert "a noise of 0.5 mm where the recording states 0.2 mm" in shown
+    assert not doubts({"detection": {}, "noise": {"points": noisy | {"stated_sd_m": 3e-4}}})
     run = synthetic()
     parts = {name: run[name] for name in ("sheet", "estimates", "belief")}
     poor = dataclasses.replace(run["detection"], converged=False)

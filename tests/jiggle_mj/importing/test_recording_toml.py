@@ -16,6 +16,10 @@ from tests.support.measured_folder import TOML, bring_in, folder
         ('unit = "mm"', 'Unit = "mm"', "did you write 'Unit' for it"),
         ('unit = "mm"', 'time_unit = "ms"', r"lacks the key 'unit'\.$"),
         ("noise_sd = 1e-4", "noise = 1e-4", "lacks the key 'noise_sd'; did you write 'noise' for it"),
+        ("noise_sd = 1e-4", "noise_sd = 1e-4\npoint_sd = 1e-4", "noise_sd is all noise together, and point_sd a part"),
+        ("noise_sd = 1e-4", "noise_sd = 1e-4\nsmooth_sd = 1e-4", "smooth_sd needs point_sd"),
+        ("noise_sd = 1e-4", "point_sd = 1e-4\nsmooth_sd = 1e-4", "lacks the key 'smooth_length'"),
+        ("noise_sd = 1e-4", "point_sd = 1e-4\nsmooth_sd = -1", "smooth_sd must be a number"),
         ('files = ["rest.xyz", "pulled_*.xyz"]', 'file = ["rest.xyz"]', "lacks the key 'files'; did you write 'file'"),
         ("period = 0.5", "period = 0", "period must be a number above 0; got 0"),
         ('name = "grid"', "name = 3", "name must be a text; got 3"),
@@ -66,6 +70,14 @@ def test_a_wrong_toml_is_refused_with_key_value_and_what_is_allowed(tmp_path, ol
         bring_in(where)
     assert "\n" not in str(refusal.value)
     assert not (where / "run.mcap").exists() and not (where / "run.truth.mcap").exists()
+
+
+def test_the_noise_is_that_of_single_points_and_the_one_that_neighbours_share(tmp_path):
+    stated = "point_sd = 3e-4\nsmooth_sd = 4e-4\nsmooth_length = 0.01"
+    _, recording = bring_in(folder(tmp_path, toml=TOML.replace("noise_sd = 1e-4", stated)))
+    points = next(iter(recording)).points
+    assert points.sd == pytest.approx(5e-4)  # 3, 4, 5
+    assert (points.smooth_sd, points.smooth_length, points.sd_stated) == (4e-4, 0.01, True)
 
 
 def test_a_missing_toml_is_refused(tmp_path):

@@ -26,6 +26,7 @@ from jiggle_mj.recording.schemas import (
     pose_message,
 )
 from jiggle_mj.recording.topics import GRASP, LEFT, POINTS, POSE, RIGHT, TF
+from jiggle_mj.recording.writer import RecordingWriter
 from tests.support.recordings import MS, ROUNDING, Bag, camera, image, malformed, read_all, tool
 
 JPEG_LOSS = 3
@@ -57,6 +58,29 @@ def test_the_noise_of_points_is_that_of_those_seen_and_must_be_one_positive_numb
     assert kept.points.sd == 1e-3
     (_, zero_sd), (_, two_sds) = recording.skipped
     assert "sd must be above 0 and finite, in m; got 0.0" in zero_sd and "from 0.001 to 0.002" in two_sds
+
+
+def test_noise_that_neighbours_share_is_read_as_it_was_written_and_the_lack_of_a_statement_too(tmp_path):
+    """In turn: all is stated; nothing; the shared noise is more than all noise together."""
+    xyz = dict(zip("xyz", np.random.default_rng(0).normal(size=(3, 4)), strict=True))
+    bag, stated = Bag(tmp_path / "noise.mcap"), [{"sd": 2e-4, "smooth_sd": 1e-4, "smooth_length": 0.01}, {}]
+    for number, noise in enumerate([*stated, {"sd": 1e-4, "smooth_sd": 2e-4, "smooth_length": 0.01}]):
+        bag.tool(number * MS)
+        columns = {name: np.full(4, value) for name, value in noise.items()}
+        bag.output.message(POINTS, number * MS, point_cloud(number * MS, xyz | columns))
+    bag.output.close()
+    recording = Recording.open(tmp_path / "noise.mcap")
+    all_stated, none_stated = recording
+    assert (all_stated.points.sd, all_stated.points.smooth_sd, all_stated.points.smooth_length) == (2e-4, 1e-4, 0.01)
+    assert all_stated.points.sd_stated and not none_stated.points.sd_stated
+    ((_, reason),) = recording.skipped
+    assert "of which it is a part" in reason
+    with RecordingWriter(tmp_path / "again.mcap", camera=None, declaration=Declaration(), metadata={}) as writer:
+        for observation in (all_stated, none_stated):
+            writer.write(observation)
+    for one, other in zip(Recording.open(tmp_path / "again.mcap"), (all_stated, none_stated), strict=True):
+        names = ("sd", "sd_stated", "smooth_sd", "smooth_length")
+        assert [getattr(one.points, name) for name in names] == [getattr(other.points, name) for name in names]
 
 
 def test_frames_that_fail_a_check_are_named_and_skipped(tmp_path):
