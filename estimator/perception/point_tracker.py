@@ -79,7 +79,7 @@ class PointTracker:
         self._rest_variance: Float[np.ndarray, " n"] = rest_variance
         self._still_sd = still[0].sd
         positions = np.array([_positions(frame, self.ids) for frame in frames])
-        seen = np.isfinite(positions).all(axis=2).any(axis=0)
+        seen = np.asarray(np.isfinite(positions).all(axis=2).any(axis=0))
         self.noise = CombinedNoise.of(still[0], measure([positions], sheet.rest))
         self._fields = self._shared(self.noise.noise, sheet.rest, seen)
         counts = self.noise.measured or self._fields is not None

@@ -3,9 +3,10 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from jiggle_mj.estimator import Estimator
-from jiggle_mj.estimator.attribution.dataset import assumed, collect_dataset
+from jiggle_mj.estimator.attribution.dataset import assumed, collect_dataset, stated
 from jiggle_mj.observation import DeclaredMesh
 from tests.support.lifted_recording import N_STILL, NOISE, observed
 from tests.support.small_sheet import DECLARATION, sheet
@@ -17,6 +18,14 @@ def test_without_still_frames_the_noise_is_assumed():
     rest = dataclasses.replace(rest, points=observed(1.0)[0].points)
     dataset = collect_dataset(DECLARATION, None, [rest, *observations])
     assert dataset.noise == assumed(NOISE)
+
+
+def test_points_that_state_noise_which_neighbours_share_have_it_and_others_as_much_of_it_as_of_all():
+    points = observed(1.0)[0].points
+    found = stated(dataclasses.replace(points, sd=5e-4, smooth_sd=4e-4, smooth_length=0.01))
+    assert (found.smooth_sd, found.length, found.frames) == (4e-4, 0.01, 0)
+    assert found.total_sd == pytest.approx(5e-4)
+    assert stated(points) == assumed(points.sd)
 
 
 def test_time_starts_at_the_rest_shape():
