@@ -1,6 +1,6 @@
 """The estimator's settings, and the ranges that they may have."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 from jiggle_mj.argument_checks import as_choice, as_integer, as_number, store
@@ -21,13 +21,14 @@ POSITIVE = (
     "reference",
     "prior_sd",
     "force_sd",
+    "cloud_force_sd",
     "anchor_sd",
     "grip_sd",
     "grip_stiffness",
     "detect_above",
 )
 """Settings that must be above 0."""
-SHARES = ("reference", "prior_sd", "force_sd", "grip_stiffness", "detect_above")
+SHARES = ("reference", "prior_sd", "force_sd", "cloud_force_sd", "grip_stiffness", "detect_above")
 """Settings that are shares of the membrane stiffness."""
 LARGEST_RATIO = 1e7
 """Largest ratio of such a setting to the membrane stiffness, and of the membrane stiffness to it: what float32 can add
@@ -61,6 +62,10 @@ class EstimatorConfig:
     force_sd: float = 4.5e-3
     """Standard deviation of the model's force error on a particle [k x spacing]. For the filter 'implicit' it holds
     where forces of 0.07 k x spacing meet, and grows in proportion to them."""
+    cloud_force_sd: float = 1.35e-3
+    """The same for the filter 'implicit' on clouds [k x spacing]. A cloud lets the state slide, which takes up most of
+    the error that neighbours share; where what is left is larger, residuals raise it. With `force_sd` a cloud holds so
+    little evidence that what is attached is called free."""
     anchor_sd: float = 1e-4
     """Standard deviation of a welded particle from its anchor, for the filter 'implicit' [m]."""
     grip_sd: float = 1.5e-3
@@ -104,3 +109,11 @@ class EstimatorConfig:
             seed=as_integer(self.seed, f"{name}.seed", at_least=0),
         )
         check_parts(self)
+
+
+def for_clouds(config: EstimatorConfig) -> EstimatorConfig:
+    """Return the settings with those of the filter 'implicit' for clouds without identities in place of the others."""
+    if config.filter != "implicit":
+        return config
+    belief = replace(config.belief, mesh_transfer=config.belief.cloud_mesh_transfer)
+    return replace(config, force_sd=config.cloud_force_sd, belief=belief)

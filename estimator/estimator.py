@@ -33,6 +33,7 @@ from .fusion import fill_unseen, fuse, pull
 from .grip import GripHold, GripTracker
 from .identification import identify
 from .perception import Disparity, FrameMask, Perception, SimulatorInput, TissueMask, Track
+from .perception.cloud_tracker import matched
 from .physics.environment import Grip
 from .tracked_sheet import TrackedSheet
 
@@ -120,19 +121,18 @@ class Estimator:
         tracked, began = self._tracked, time.perf_counter()
         track = self._see(observation)
         seen = time.perf_counter()
-        if not track.visible.any():
+        if track.cloud is None and not track.visible.any():
             self.skipped.append((observation.index, "no particle was seen"))
             return None
         hold, before = self._grasp(track, tool)
         frame = fuse(track, hold, tool, before, grip_sd=self.config.grip_sd, field=tracked.field)
-        self._slip = frame.slip
-        self._seen_precision = track.white_precision[track.visible].mean(axis=0)
-        tracked.state, update = tracked.filter.update(tracked.state, frame.evidence, jnp.asarray(frame.start))
+        state, update = tracked.filter.update(tracked.state, frame.evidence, jnp.asarray(frame.start))
         if not update.explains_the_frame:
-            raise PerceptionError(
-                f"observation {observation.index} leaves the filter without a finite state: no sheet explains it."
-            )
-        self._grip.hold, tracked.x = hold, np.asarray(update.x)
+            raise PerceptionError(f"observation {observation.index} leaves no finite state: no sheet explains it.")
+        track = track if track.cloud is None else matched(track.cloud, np.asarray(update.x), hold.held)
+        tracked.state, tracked.x = state, np.asarray(update.x)
+        self._grip.hold, self._slip = hold, frame.slip
+        self._seen_precision = track.white_precision[track.visible].mean(axis=0)
         if self.config.refinement == "frames":
             tracked.state = tracked.filter.resample(tracked.state)
         summary = tracked.state.summary
@@ -165,7 +165,8 @@ class Estimator:
             if not self._perception.ready:
                 raise PerceptionError("no frame has shown the sheet yet; wait for one before planning a grasp.")
             with jax.enable_x64(True), one_thread():
-                self._tracked_or_none = TrackedSheet.build(self._perception.sheet(), self.declaration, self.config)
+                sheet, identified = self._perception.sheet(), self._perception.identifies
+                self._tracked_or_none = TrackedSheet.build(sheet, self.declaration, self.config, identified=identified)
         return self.sheet
 
     def release(self) -> None:
@@ -373,12 +374,11 @@ class Estimator:
             )
 
     def _see(self, observation: Observation) -> Track:
-        return self._perception.track(
-            observation, predicted=self._tracked.x, simulator_input=lambda: self._prediction(observation.tool)
-        )
+        simulated = None if self._tracked.filter.matches_clouds else lambda: self._prediction(observation.tool)
+        return self._perception.track(observation, predicted=self._tracked.x, simulator_input=simulated)
 
     def _prediction(self, tool: ToolState) -> SimulatorInput:
-        """Return the state before a frame, b, and the moved grip, for a cloud without identities."""
+        """Return the state before a frame, b, and the moved grip, for a filter that needs positions of a cloud."""
         tracked = self._tracked
         hold, before = self._grasp(Track.of_nothing(len(tracked.x)), tool)
         stiffness = jnp.where(hold.held, self.config.grip_stiffness * self.declaration.membrane_stiffness, 0.0)

@@ -13,6 +13,9 @@ from .grip import GripHold
 from .perception.mesh_field import MeshField
 from .perception.track import Track
 
+BESIDE_GRIP = 0.5
+"""Standard deviation of a particle beside the grip from where the grip's motion takes it, for clouds [spacing]: a cloud
+does not show how it slides, and its balance of forces is unknown."""
 FILL_STIFFNESS = 1.0
 """Roughness penalty of the fields that fill unseen particles [1]: they move with their surroundings."""
 
@@ -62,6 +65,9 @@ def fuse(
     )
     motion = np.where(known[:, None], y - before, 0.0)
     start = before + np.where(held[:, None], motion, field.fill(motion, known, stiffness=FILL_STIFFNESS))
+    if track.cloud is not None:
+        beside = field.dilated(held) & ~held
+        precision[beside] += np.eye(3) / (BESIDE_GRIP * float(track.cloud.surface.spacing)) ** 2
     evidence = Evidence(
         y=jnp.asarray(np.where(known[:, None], y, start)),
         precision=jnp.asarray(precision),
@@ -69,6 +75,7 @@ def fuse(
         force_unknown=jnp.asarray(field.dilated(held)),
         fields=track.fields,
         pull=pull(before, tool, hold),
+        cloud=track.cloud,
     )
     return FusedFrame(evidence=evidence, start=start, slip=float(np.median(distance)) if len(distance) else 0.0)
 

@@ -12,7 +12,7 @@ from jiggle_mj.mesh_checks import check_unfolded
 from jiggle_mj.observation import Declaration
 from jiggle_mj.sheet_triangulation import SheetPlane
 
-from .config import EstimatorConfig
+from .config import EstimatorConfig, for_clouds
 from .filter_builder import build_filter
 from .filters.filter import Filter, FilterState
 from .perception.mesh_field import MeshField
@@ -39,14 +39,16 @@ class TrackedSheet:
     """Positions with open jaws when they were last asked for, at first at rest [m]."""
 
     @classmethod
-    def build(cls, sheet: Sheet, declaration: Declaration, config: EstimatorConfig) -> "TrackedSheet":
-        """Build the filter for a sheet at rest.
+    def build(
+        cls, sheet: Sheet, declaration: Declaration, config: EstimatorConfig, *, identified: bool
+    ) -> "TrackedSheet":
+        """Build the filter for a sheet at rest, whose particles measurements identify or not.
 
         Raises:
             MeshError: the sheet is folded, or not one sheet.
         """
         mesh, plane = unfolded(sheet)
-        filter = build_filter(mesh, declaration, config)
+        filter = build_filter(mesh, declaration, config if identified else for_clouds(config))
         state = filter.init(jax.random.key(config.seed))
         return cls(
             sheet=sheet,

@@ -47,6 +47,9 @@ class BeliefConfig:
     """Standard deviation of the share of an attachment that a mesh assigns to the neighbour along each edge instead,
     from images of the shipped scenes. It is scaled by s (1 - s): a free particle has nothing to assign and a weld does
     not become softer."""
+    cloud_mesh_transfer: float = 0.3
+    """The same for clouds without identities: they show where the sheet bends, and not which of two neighbours bends
+    it. Chosen on one recording each of `arc` and `line`."""
     open_above: float = 0.9
     """Bounded stiffness above which the upper end of an interval is infinite: nine times b_ref and a weld
     differ by less than the mesh resolves."""
@@ -59,6 +62,7 @@ class BeliefConfig:
         """Check types and ranges."""
         shares = ("damping", "learning_rate", "open_above")
         check_ranges(self, positive=shares, shares=shares)
-        as_number(self.mesh_transfer, "BeliefConfig.mesh_transfer", at_least=0)
+        for name in ("mesh_transfer", "cloud_mesh_transfer"):
+            as_number(getattr(self, name), f"BeliefConfig.{name}", at_least=0)
         as_number(self.tail, "BeliefConfig.tail", above=0, below=0.5)
         check_parts(self)

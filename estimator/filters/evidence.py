@@ -2,7 +2,14 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
+
+from ..perception.cloud_surface import Cloud
+
+MIN_DIRECTION = 1e-6
+"""Smallest precision that counts as an observation of a direction [largest precision of the particle]."""
+MIN_PRECISION = 1e-3
+"""The same where nothing is known of a particle [1/m^2]: a standard deviation of 30 m."""
 
 
 class Pull(eqx.Module):
@@ -32,15 +39,39 @@ class Evidence(eqx.Module):
     One array serves all frames of a recording: it counts as `seen_fields`. None where no noise is shared."""
     pull: Pull | None = None
     """The tool's step; None for filters that simulate none."""
+    cloud: Cloud | None = None
+    """A cloud without identities, whose observations depend on the state: see `near`. Position and precision are then
+    what is known without it. None where the particles are identified."""
+
+    def near(self, x: Float[Array, "n 3"], *, gate: float = 0.0) -> "Evidence":
+        """Return the evidence with a cloud matched to the surface at a state; see `Cloud.matched` for the gate."""
+        if self.cloud is None:
+            return self
+        pull, precision = self.cloud.matched(x, self.held, gate=gate)
+        pull = pull + jnp.einsum("nij,nj->ni", self.precision, self.y - x)
+        precision = precision + self.precision
+        floor = jnp.maximum(MIN_DIRECTION * jnp.trace(precision, axis1=1, axis2=2), MIN_PRECISION)
+        y = x + jnp.linalg.solve(precision + floor[:, None, None] * jnp.eye(3)[None], pull[:, :, None])[:, :, 0]
+        return eqx.tree_at(
+            lambda e: (e.y, e.precision, e.cloud), self, (y, precision, None), is_leaf=lambda leaf: leaf is None
+        )
+
+    def of_grip(self) -> "Evidence":
+        """Return what the jaws alone say."""
+        held = jnp.where(self.held[:, None, None], self.precision, 0.0)
+        return eqx.tree_at(lambda e: (e.precision, e.cloud), self, (held, None), is_leaf=lambda leaf: leaf is None)
 
     def inflated(self, variance: float) -> "Evidence":
         """Return the evidence with `variance` times the variance of what was seen; the held particles keep theirs."""
         precision = jnp.where(self.held[:, None, None], self.precision, self.precision / variance)
         fields = None if self.fields is None else self.fields * jnp.sqrt(variance)
+        cloud = self.cloud
+        if cloud is not None:
+            cloud = eqx.tree_at(lambda c: c.sd_ratio, cloud, cloud.sd_ratio * jnp.sqrt(variance))
         return eqx.tree_at(
-            lambda evidence: (evidence.precision, evidence.fields),
+            lambda evidence: (evidence.precision, evidence.fields, evidence.cloud),
             self,
-            (precision, fields),
+            (precision, fields, cloud),
             is_leaf=lambda leaf: leaf is None,
         )
 
@@ -67,3 +98,10 @@ class Evidence(eqx.Module):
     def seen(self) -> Bool[Array, " n"]:
         """Particles of which anything is known, by perception or by the grip."""
         return jnp.trace(self.precision, axis1=1, axis2=2) > 0
+
+    @property
+    def directions(self) -> Int[Array, " n"]:
+        """In how many directions each particle is observed [1]: 3, or fewer by a cloud."""
+        values = jnp.linalg.eigvalsh(self.precision)
+        known = values > jnp.maximum(MIN_DIRECTION * values[:, -1:], MIN_PRECISION)
+        return jnp.sum(known, axis=1)

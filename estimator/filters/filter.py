@@ -50,6 +50,11 @@ class Filter(eqx.Module, Generic[State]):
     def name(self) -> FilterName:
         """What the settings call the filter."""
 
+    @property
+    def matches_clouds(self) -> bool:
+        """Whether the filter matches a cloud without identities to its own state, or needs positions."""
+        return False
+
     @abstractmethod
     def init(self, key: PRNGKeyArray) -> State:
         """Return the state before the first frame.
@@ -118,6 +123,11 @@ class Filter(eqx.Module, Generic[State]):
 
 class ForceBalanceFilter(Filter[State]):
     """A filter over bounded stiffnesses that linearises the balance of forces, and keeps the frames to do it again."""
+
+    @property
+    def matches_clouds(self) -> bool:
+        """Whether the filter matches a cloud without identities to its own state."""
+        return True
 
     @abstractmethod
     def balance(self, state: State) -> ForceBalance:

@@ -13,7 +13,8 @@ H = dr/dx, W = cov(n_f)^-1 (0 where the force is unknown), A = R^-1 + H^T W H an
 x leaves the evidence D^T N^-1 D about s. D counts as far as it exceeds its own error (`calibrated`).
 
 The balance is linear in s at the observed state, so the response of a free sheet, which is strongly nonlinear, is never
-needed. R and A are without the noise that neighbours share (`smooth_noise`). Each position must belong to a particle.
+needed. R and A are without the noise that neighbours share (`smooth_noise`). A cloud is matched anew at each state
+(`Evidence.near`).
 """
 
 from functools import partial
@@ -45,6 +46,8 @@ from .tethered import Tethered
 
 STEP_LENGTHS = (0.0, 0.1, 0.25, 0.5, 1.0)
 """Shares of a step that the line search tries [1]; the first is no step, so that a step never raises the cost."""
+CLOUD_GATES = (2.0, 1.0, 0.5, 0.25)
+"""Heights up to which points of a cloud count while the sheet settles, matched anew each time [spacing]."""
 MIN_SQUARE = 1e-30
 """Lower bound of |D|^2 where it divides [N^2]: far below the square of any force in a sheet."""
 
@@ -100,10 +103,10 @@ class ForceBalance(eqx.Module):
             mesh: the sheet.
             energy: of the sheet without attachments and grip.
             reference: b_ref [N/m].
-            force_sd: tau where forces of `force_level` meet [N].
-            force_level: sum of the forces that meet at a particle for which `force_sd` holds [N].
-            anchor_sd: sigma_a [m].
-            grip_stiffness: of the springs of held particles [N/m].
+            force_sd: tau where forces of `force_level` meet [N], as the other numbers at the fields.
+            force_level: see there [N].
+            anchor_sd: see there [m].
+            grip_stiffness: see there [N/m].
             config: numbers of the linearisation; the defaults if None.
         """
         neighbours = neighbour_table(mesh.adjacency)
@@ -153,6 +156,7 @@ class ForceBalance(eqx.Module):
             flow = flow.at[term.vertices].add(jnp.sqrt(jnp.sum(term.gradient(x[term.vertices]) ** 2, axis=-1)))
         return self.force_sd * jnp.sqrt(self.config.force_sd_floor**2 + (flow / self.force_level) ** 2)
 
+    @eqx.filter_jit
     def settle(
         self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence, *, unbalanced: float | None = None
     ) -> Float[Array, "n 3"]:
@@ -164,12 +168,14 @@ class ForceBalance(eqx.Module):
         unbalanced = self.config.smooth_force if unbalanced is None else unbalanced
         b, sd = self.reference * s / (1 - s), self.config.force_sd_floor * self.force_sd
         tolerance, stiff = unbalanced * sd, self.grip_stiffness
-        return self.tethered.settle(b, evidence, x, force_sd=sd, force_tolerance=tolerance, grip_stiffness=stiff).x
+        for gate in CLOUD_GATES if evidence.cloud is not None else CLOUD_GATES[-1:]:
+            near = evidence.near(x, gate=gate)
+            x = self.tethered.settle(b, near, x, force_sd=sd, force_tolerance=tolerance, grip_stiffness=stiff).x
+        return x
 
     def predict(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
         """Return the equilibrium at fixed s of the sheet that only the grip pulls at [m], searched from x."""
-        held = jnp.where(evidence.held[:, None, None], evidence.precision, 0.0)
-        return self.settle(x, s, eqx.tree_at(lambda seen: seen.precision, evidence, held), unbalanced=1.0)
+        return self.settle(x, s, evidence.of_grip(), unbalanced=1.0)
 
     def approach(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Frame:
         """Return the frame linearised at the state that Gauss-Newton steps from x, at fixed s, lead to.
@@ -184,7 +190,7 @@ class ForceBalance(eqx.Module):
         def step(state):
             _, x, _, count = state
             frame = self.linearise(x, s, single)
-            following, costs = self._best_along(frame, self._state_step(frame, s, single), s, single)
+            following, costs = self._best_along(frame, self._state_step(frame, s), s)
             return frame, following, jnp.nanmin(costs) < (1 - config.min_cost_decrease) * costs[0], count + 1
 
         def unfinished(state):
@@ -197,28 +203,32 @@ class ForceBalance(eqx.Module):
         frame, _, decreasing, _ = jax.lax.while_loop(unfinished, step, (empty, x, jnp.asarray(True), jnp.asarray(0)))
         if evidence.fields is not None:
             near = self.linearise(frame.x, s, evidence)
-            frame = self.linearise(self.polish(near, s, evidence), s, evidence)
+            frame = self.linearise(self.polish(near, s), s, evidence)
         return eqx.tree_at(lambda frame: frame.converged, frame, ~decreasing)
 
+    @eqx.filter_jit
     def evidence_near(
         self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
     ) -> tuple[Frame, Fit, FrameInformation]:
         """Return a frame linearised at a state near x [m], its fit, and its evidence about s, as one program."""
-        return _evidence_near(self, x, s, evidence)
+        frame = self.approach(x, s, evidence)
+        fit = self.fit(frame)
+        return frame, fit, self.information(frame, fit)
 
     def settled_evidence(
         self, start: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
     ) -> tuple[Frame, FrameInformation]:
         """Return a frame linearised near where the sheet settles from `start` [m], and its evidence about s."""
-        frame, _, information = self.evidence_near(_settle(self, start, s, evidence), s, evidence)
+        frame, _, information = self.evidence_near(self.settle(start, s, evidence), s, evidence)
         return frame, information
 
-    def polish(self, frame: Frame, s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
+    def polish(self, frame: Frame, s: Float[Array, " n"]) -> Float[Array, "n 3"]:
         """Return the state for another s [m], by one step with the frame's own factor."""
-        return self._best_along(frame, self._state_step(frame, s, evidence), s, evidence)[0]
+        return self._best_along(frame, self._state_step(frame, s), s)[0]
 
     def linearise(self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence) -> Frame:
         """Return the balance of forces linearised at x and s."""
+        evidence = evidence.near(x)
         internal, error = self._internal_dr_dx(x), self.error(x)
         weight = self._weight(error, s, evidence)
         identity = (self.neighbours == jnp.arange(len(x))[:, None])[:, :, None, None]
@@ -241,7 +251,7 @@ class ForceBalance(eqx.Module):
             factor=factor,
             smooth=FrameNoise.build(self.layout, factor, precision, fields) if fields.shape[1] else None,
             converged=jnp.asarray(True),
-            innovation=jnp.where(evidence.seen[:, None], evidence.y - x, 0.0),
+            evidence=evidence,
         )
 
     def fit(self, frame: Frame) -> Fit:
@@ -286,14 +296,17 @@ class ForceBalance(eqx.Module):
         pushed = self._transposed(frame.dr_dx, frame.weight[:, None] * v)
         return frame.weight[:, None] * (v - self.apply(frame.dr_dx, self._solved(frame, pushed)))
 
-    def residuals(self, frame: Frame, fit: Fit, evidence: Evidence) -> ForceResiduals:
+    def residuals(self, frame: Frame, fit: Fit) -> ForceResiduals:
         """Return the whitened residuals of the frame's fit, with their degrees of freedom."""
+        evidence = frame.evidence
         w, free, smooth = frame.weight, evidence.seen & ~evidence.held, frame.smooth
         fitted = w * window_sums(self.layout, fit.covariance, self.places, frame.dr_dx)
-        root = jnp.linalg.cholesky(jnp.where(free[:, None, None], evidence.white_precision, jnp.eye(3)))
+        white = evidence.white_precision + self.config.position_precision_floor * jnp.eye(3)[None]
+        root = jnp.linalg.cholesky(jnp.where(free[:, None, None], white, jnp.eye(3)))
         root = jnp.where(free[:, None, None], jnp.swapaxes(root, 1, 2), 0.0)
         seen = window_sums(self.layout, fit.covariance, self.own_place, root[:, None])
-        position, position_degrees = fit.position_residual, jnp.sum(jnp.where(free, 3 - seen, 0.0))
+        observed, position = evidence.directions.astype(seen.dtype), fit.position_residual
+        position_degrees = jnp.sum(jnp.where(free, observed - seen, 0.0))
         if smooth is not None:
             fitted = fitted + w * smooth.spread_of(partial(self.apply, frame.dr_dx))
             position = position - smooth.explained(position)
@@ -332,10 +345,10 @@ class ForceBalance(eqx.Module):
         return (1 - s)[:, None] * internal + (s * self.reference)[:, None] * d
 
     def _best_along(
-        self, frame: Frame, move: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
+        self, frame: Frame, move: Float[Array, "n 3"], s: Float[Array, " n"]
     ) -> tuple[Float[Array, "n 3"], Float[Array, " _lengths"]]:
         """Return the point of least cost among a few along a move from a frame's state, and the costs of all."""
-        weight = self._weight(frame.error, s, evidence)
+        evidence, weight = frame.evidence, self._weight(frame.error, s, frame.evidence)
 
         def cost(length: Float[Array, ""]) -> Float[Array, ""]:
             x = frame.x + length * move
@@ -367,11 +380,12 @@ class ForceBalance(eqx.Module):
         padded = jnp.concatenate([v, jnp.zeros((1, 3), v.dtype)])
         return jnp.einsum("npij,npj->ni", rows, padded[self.neighbours])
 
-    def _state_step(self, frame: Frame, s: Float[Array, " n"], evidence: Evidence) -> Float[Array, "n 3"]:
+    def _state_step(self, frame: Frame, s: Float[Array, " n"]) -> Float[Array, "n 3"]:
         """Return the step A^-1 (R^-1 (y - x) - H^T W r) at fixed s; a Gauss-Newton step if s is the frame's, as A is.
 
         With D = b_ref d - f it is r = b_ref d - (1 - s) D and H = b_ref I - (1 - s) dD/dx.
         """
+        evidence = frame.evidence
         pull = jnp.einsum("nij,nj->ni", evidence.white_precision, evidence.y - frame.x)
         d, free = frame.x - self.energy.rest, (1 - s)[:, None]
         unbalanced = self.reference * d - free * frame.dr_ds
@@ -385,16 +399,3 @@ class ForceBalance(eqx.Module):
         """Return A^-1 v, with the smooth noise in A."""
         solved = solve(self.layout, frame.factor, v)
         return solved if frame.smooth is None else solved + frame.smooth.added_state(solved)
-
-
-_settle = eqx.filter_jit(ForceBalance.settle)
-
-
-@eqx.filter_jit
-def _evidence_near(
-    balance: ForceBalance, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
-) -> tuple[Frame, Fit, FrameInformation]:
-    """Return a frame linearised at a state near x, its fit, and its evidence about s."""
-    frame = balance.approach(x, s, evidence)
-    fit = balance.fit(frame)
-    return frame, fit, balance.information(frame, fit)

@@ -1,9 +1,11 @@
 """One frame's linearised balance of forces, the state fitted to it, and its evidence about s."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..physics.block_tridiagonal import BlockCholesky, BlockTridiagonal
+from .evidence import Evidence
 from .smooth_noise import FrameNoise
 
 
@@ -28,12 +30,17 @@ class Frame(eqx.Module):
     """W, the inverse variance of each component of r [1/N^2]; 0 where the force is unknown."""
     factor: BlockCholesky
     """Cholesky factor of A = R^-1 + H^T W H, with R the white noise alone; `smooth` adds what neighbours share."""
-    innovation: Float[Array, "n 3"]
-    """y - x, zero where nothing was seen [m]."""
+    evidence: Evidence
+    """What was measured; a cloud as it is matched to the surface at x."""
     smooth: FrameNoise | None
     """Noise that neighbours share; None for none."""
     converged: Bool[Array, ""]
     """Whether the search for x, if there was one, ended before its largest number of steps."""
+
+    @property
+    def innovation(self) -> Float[Array, "n 3"]:
+        """Return y - x, zero where nothing was seen [m]."""
+        return jnp.where(self.evidence.seen[:, None], self.evidence.y - self.x, 0.0)
 
 
 class Fit(eqx.Module):

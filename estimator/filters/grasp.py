@@ -70,7 +70,7 @@ class GraspFrames(eqx.Module):
         def relinearise(k: int) -> tuple[Float[Array, "n 3"], FrameInformation, ForceResiduals]:
             evidence = self.frames[k].evidence.inflated(noise.position)
             frame, fit, information = balance.evidence_near(self.frames[k].x, s, evidence)
-            return frame.x, information, _residuals(balance, frame, fit, evidence)
+            return frame.x, information, _residuals(balance, frame, fit)
 
         for k, (x, information, residuals) in parallel_map(relinearise, range(len(self.frames))).items():
             grasp = grasp.with_frame(self.frames[k].evidence, x, information, residuals)

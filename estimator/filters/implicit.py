@@ -279,9 +279,9 @@ def _updated(
 ) -> Update:
     """Return the belief after a frame's evidence, and the state for it."""
     belief, gaussian = belief.updated(information.precision, information.shift)
-    nis = _normalised_innovation(information, gaussian, evidence)
+    nis = _normalised_innovation(information, gaussian, frame.evidence)
     summary = _summary(belief, Convergence.SEARCH_CUT_OFF.unless(frame.converged))
-    x = balance.polish(frame, belief.bounded(summary.b), evidence)
+    x = balance.polish(frame, belief.bounded(summary.b))
     return Update(**vars(summary), x=x, nis=nis)
 
 
@@ -331,6 +331,6 @@ def _normalised_innovation(information: FrameInformation, gaussian: Gaussian, ev
     the middle matrix as its covariance.
     """
     explained = information.score @ gaussian.solve(information.score)
-    observed = 3 * jnp.sum(evidence.seen)
+    observed = jnp.sum(evidence.directions)
     degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.force_unknown), 1)
     return (information.chi2 - explained) / degrees.astype(explained.dtype)

@@ -1,12 +1,14 @@
-"""Tracker of clouds whose points have no identities: the paper's joint estimation of state and attachments.
+"""Trackers of clouds whose points have no identities, over a mesh that is laid over the clouds of the sheet at rest.
 
-A mesh is laid over the clouds of the sheet at rest. Each later cloud is matched by one step of the simulator f', whose
-sweeps include the gradient of the chamfer distance (`xpbd`, `chamfer`) and whose attachments are the belief's: the
-state of a frame depends on the belief, and the belief on the states. The observation of a particle is then the mean of
-the points around it, along the sheet's normal. A cloud shows where the surface is, and not which point of it. Along the
-surface the particles are where the simulator moves them, with a standard deviation of `CloudTrackerConfig.slide_sd`. A
-cloud does not show that the sheet slides within its own surface.
+The filter 'implicit' matches each cloud to the state that it searches for (`cloud_surface`), so that state and
+attachments are estimated together. For the other filters a cloud becomes positions as in the paper: one step of the
+simulator f', whose sweeps include the gradient of the chamfer distance (`xpbd`, `chamfer`) and whose attachments are
+the belief's. The observation of a particle is then the mean of the points around it, along the sheet's normal. Along
+the surface the particles are where the simulator moves them, with a standard deviation of
+`CloudTrackerConfig.slide_sd`.
 """
+
+from functools import cached_property
 
 import equinox as eqx
 import jax
@@ -27,8 +29,12 @@ from ..physics.mesh import SheetMesh
 from ..physics.simulator import simulator
 from ..physics.xpbd import XPBD
 from .chamfer import Chamfer
+from .cloud_surface import Cloud, CloudSurface
 from .config import CloudTrackerConfig
 from .track import UNSEEN_VARIANCE, Track
+
+MIN_SHARE = 0.5
+"""Smallest share of a cloud's points that lie on the sheet."""
 
 
 def lay_mesh(still: list[MeasuredPoints], *, spacing: float, config: CloudTrackerConfig | None = None) -> Sheet:
@@ -96,16 +102,39 @@ def thinned(flat: Float[np.ndarray, "m 2"], spacing: float) -> list[int]:
 class CloudTracker:
     """Tracker of one sheet in a recording of clouds."""
 
-    def __init__(self, sheet: Sheet, declaration: Declaration, config: CloudTrackerConfig | None = None):
-        mesh, self._config = SheetMesh(sheet.rest, sheet.faces), config or CloudTrackerConfig()
-        self._simulator = simulator(mesh, declaration)
-        self._chamfer = Chamfer.build(mesh, count=self._config.samples, reach=self._config.reach * mesh.spacing)
-        self._faces, self._neighbourhood = sheet.faces, self._config.neighbourhood * mesh.spacing
+    def __init__(
+        self,
+        sheet: Sheet,
+        declaration: Declaration,
+        still: list[MeasuredPoints],
+        config: CloudTrackerConfig | None = None,
+    ):
+        """Prepare the mesh, and measure the clouds of the sheet at rest."""
+        self._mesh, self._config = SheetMesh(sheet.rest, sheet.faces), config or CloudTrackerConfig()
+        self._declaration, self._neighbourhood = declaration, self._config.neighbourhood * self._mesh.spacing
+        finite = [points.positions[np.isfinite(points.positions).all(axis=1)] for points in still]
+        self._surface = CloudSurface.build(self._mesh, finite, sd=still[0].sd)
 
-    def track(
+    def unmatched(self, points: MeasuredPoints) -> Track:
+        """Return a cloud that the filter is to match; `matched` says afterwards what it shows.
+
+        Raises:
+            PerceptionError: the cloud has too few points.
+        """
+        cloud = self._finite(points)
+        if len(cloud) < self._config.min_points:
+            raise PerceptionError(f"the cloud has {len(cloud)} points; a sheet needs {self._config.min_points}.")
+        padded = np.full((self._config.samples, 3), np.nan)
+        padded[: len(cloud)] = cloud
+        sd = jnp.asarray(points.sd)
+        return Track.of_nothing(
+            self._mesh.n, Cloud(surface=self._surface, points=jnp.asarray(padded), sd=sd, sd_ratio=jnp.ones_like(sd))
+        )
+
+    def simulated(
         self, points: MeasuredPoints, before: Float[np.ndarray, "n 3"], b: Float[np.ndarray, " n"], grip: Grip
     ) -> Track:
-        """Return the particles that match one cloud.
+        """Return the particles that match one cloud, by the paper's simulator.
 
         Args:
             points: the cloud.
@@ -113,16 +142,14 @@ class CloudTracker:
             b: stiffness of the attachments [N/m].
             grip: springs to the tip, which has moved since.
         """
-        samples = self._config.samples
-        cloud = points.positions[np.isfinite(points.positions).all(axis=1)]
+        cloud = self._finite(points)
         if not len(cloud):
             return Track.of_nothing(len(before))
-        cloud = cloud[np.linspace(0, len(cloud), min(len(cloud), samples), endpoint=False).astype(int)]
-        padded = np.full((samples, 3), np.nan)
+        padded = np.full((self._config.samples, 3), np.nan)
         padded[: len(cloud)] = cloud
         state = jnp.asarray(before), jnp.asarray(b), grip, jnp.asarray(padded)
-        x = np.asarray(_matched(self._simulator, self._chamfer, *state, self._config))
-        normal = trimesh.Trimesh(x, self._faces, process=False).vertex_normals
+        x = np.asarray(_matched(*self._simulator, *state, self._config))
+        normal = trimesh.Trimesh(x, self._mesh.faces, process=False).vertex_normals
         height = offset(x, normal, cloud, self._neighbourhood)
         x, seen = x + normal * height[:, None], np.isfinite(height)
         across = normal[:, :, None] * normal[:, None, :]
@@ -133,6 +160,40 @@ class CloudTracker:
             covariance=np.where(seen[:, None, None], covariance, unseen),
             visible=seen,
         )
+
+    @cached_property
+    def _simulator(self) -> tuple[XPBD, Chamfer]:
+        """The simulator, and the points on the mesh whose distance to a cloud it lowers."""
+        config, mesh = self._config, self._mesh
+        chamfer = Chamfer.build(mesh, count=config.samples, reach=config.reach * mesh.spacing)
+        return simulator(mesh, self._declaration), chamfer
+
+    def _finite(self, points: MeasuredPoints) -> Float[np.ndarray, "q 3"]:
+        """Return the points that are there, at most `CloudTrackerConfig.samples` of them, evenly chosen [m]."""
+        cloud = points.positions[np.isfinite(points.positions).all(axis=1)]
+        few = min(len(cloud), self._config.samples)
+        return cloud[np.linspace(0, len(cloud), few, endpoint=False).astype(int)]
+
+
+def matched(cloud: Cloud, x: Float[np.ndarray, "n 3"], held: Bool[np.ndarray, " n"]) -> Track:
+    """Return what a cloud shows of the particles, once the state is known [m]; they lie within a spacing of it.
+
+    Raises:
+        PerceptionError: most of the points lie off the sheet.
+    """
+    belongs, known = np.asarray(cloud.belongs(jnp.asarray(x))), np.isfinite(cloud.points).all(axis=1)
+    share = belongs.sum() / max(int(known.sum()), 1)
+    if share < MIN_SHARE:
+        raise PerceptionError(
+            f"{share:.0%} of the cloud's points lie on the sheet, and {MIN_SHARE:.0%} are needed: the cloud is of "
+            "something else, or shows more than the sheet (crop it), or is in another frame or unit."
+        )
+    pull, precision = (np.asarray(part) for part in cloud.matched(jnp.asarray(x), jnp.asarray(held)))
+    covariance = np.linalg.inv(precision + np.eye(3) / float(cloud.surface.spacing) ** 2)
+    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
+    seen = np.trace(precision, axis1=1, axis2=2) > 0
+    moved = np.einsum("nij,nj->ni", covariance, pull)
+    return Track(positions=np.where(seen[:, None], x + moved, np.nan), covariance=covariance, visible=seen)
 
 
 def offset(

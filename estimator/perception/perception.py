@@ -160,14 +160,15 @@ class Perception:
         observation: Observation,
         *,
         predicted: Float[np.ndarray, "n 3"],
-        simulator_input: Callable[[], SimulatorInput],
+        simulator_input: Callable[[], SimulatorInput] | None,
     ) -> Track:
         """Return the measurement of the particles in one frame.
 
         Args:
             observation: the frame.
             predicted: predicted positions of the particles [m].
-            simulator_input: returns the arguments of the simulator; called for clouds alone.
+            simulator_input: returns the arguments of the simulator that matches clouds, and is called for these alone;
+                None where the filter matches them itself.
 
         Raises:
             PerceptionError: the frame has no usable measurement.
@@ -177,7 +178,11 @@ class Perception:
                 observation.images, observation.tool, predicted=predicted, index=observation.index
             )
         points = _points(observation)
-        return self._points.track(points) if self._clouds is None else self._clouds.track(points, *simulator_input())
+        if self._clouds is None:
+            return self._points.track(points)
+        if simulator_input is None:
+            return self._clouds.unmatched(points)
+        return self._clouds.simulated(points, *simulator_input())
 
     def _start_stereo(self, images: StereoPair, observation: Observation) -> str | None:
         """Lay the mesh over a pair, and return None, or why it is skipped.
@@ -208,7 +213,7 @@ class Perception:
             else Sheet(rest=declared.vertices, faces=declared.faces)
         )
         refuse_many_particles(len(sheet.rest), f"a mesh over the clouds at a spacing of {self._spacing * 1e3:g} mm")
-        self._clouds = CloudTracker(sheet, self._declaration, self._config.clouds)
+        self._clouds = CloudTracker(sheet, self._declaration, self._still, self._config.clouds)
         return sheet
 
 

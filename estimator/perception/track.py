@@ -8,6 +8,8 @@ from jaxtyping import Array, Bool, Float
 
 from jiggle_mj.errors import PerceptionError
 
+from .cloud_surface import Cloud
+
 UNSEEN_VARIANCE = 1.0
 """Variance of a coordinate of an unseen particle [m^2]: far above the size of any sheet."""
 SYMMETRY_TOLERANCE = 1e-6
@@ -27,14 +29,16 @@ class Track:
     fields: Float[Array, "n modes"] | None = None
     """The part of the noise that neighbours share, as fields of unit amplitude, the same for each coordinate [m]; the
     covariance holds it too. One array serves all frames of a recording. None where none is known."""
+    cloud: Cloud | None = None
+    """A cloud that the filter matches to its own state, which alone says which particles are seen; None for none."""
     uvd: Float[np.ndarray, "n 3"] | None = None
     """Left rectified pixel and disparity [px], an estimate where unseen; None without images."""
 
     @classmethod
-    def of_nothing(cls, n: int) -> "Track":
-        """Return the track of a frame in which no particle is seen."""
+    def of_nothing(cls, n: int, cloud: Cloud | None = None) -> "Track":
+        """Return the track of a frame in which no particle is seen, or none yet."""
         covariance = np.broadcast_to(UNSEEN_VARIANCE * np.eye(3), (n, 3, 3))
-        return cls(positions=np.full((n, 3), np.nan), covariance=covariance, visible=np.zeros(n, bool))
+        return cls(positions=np.full((n, 3), np.nan), covariance=covariance, visible=np.zeros(n, bool), cloud=cloud)
 
     @cached_property
     def precision(self) -> Float[np.ndarray, "n 3 3"]:

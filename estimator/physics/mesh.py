@@ -50,12 +50,18 @@ class SheetMesh:
         return np.column_stack([half[twin, :2], half[twin, 2], half[twin + 1, 2]])
 
     @cached_property
+    def border_edges(self) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, " e"]]:
+        """Return the edges of the outline, each in the order of its triangle, and these triangles."""
+        half = self._half_edges[:, :2]
+        _, first, count = np.unique(np.sort(half, axis=1), axis=0, return_index=True, return_counts=True)
+        outer = first[count == 1]
+        return half[outer], outer % len(self.faces)
+
+    @cached_property
     def border(self) -> Bool[np.ndarray, " n"]:
         """Return which particles lie on the sheet's edge."""
-        half = np.sort(self._half_edges[:, :2], axis=1)
-        edges, faces = np.unique(half, axis=0, return_counts=True)
         on_edge = np.zeros(self.n, dtype=bool)
-        on_edge[edges[faces == 1]] = True
+        on_edge[self.border_edges[0]] = True
         return on_edge
 
     @cached_property

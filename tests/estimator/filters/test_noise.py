@@ -36,7 +36,7 @@ def drawn(request: pytest.FixtureRequest) -> list[ForceResiduals]:
         if seen.fields is not None:
             parts = parts[0], parts[1] + seen.seen_fields @ smooth
         off_balance = eqx.tree_at(lambda one: (one.unbalanced, one.innovation), frame, parts)
-        return balance.residuals(off_balance, balance.fit(off_balance), seen)
+        return balance.residuals(off_balance, balance.fit(off_balance))
 
     return [residuals(balance, key) for key in jax.random.split(jax.random.key(0), DRAWS)]
 

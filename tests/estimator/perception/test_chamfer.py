@@ -26,6 +26,11 @@ def measured(x: np.ndarray, seed: int) -> MeasuredPoints:
     return MeasuredPoints(positions=cloud(x, seed, SD), sd=SD)
 
 
+def cloud_tracker() -> CloudTracker:
+    laid = Sheet(rest=sheet().rest, faces=sheet().faces)
+    return CloudTracker(laid, DECLARATION, [measured(sheet().rest, seed) for seed in (100, 101)])
+
+
 @pytest.mark.parametrize("reach", [np.inf, 1.5e-3])
 def test_distance_and_gradient(reach):
     """Against all pairs, and against central differences over steps in which no nearest point changes."""
@@ -70,12 +75,12 @@ def test_points_that_are_nan_are_nearest_to_nothing():
 @pytest.fixture(scope="module")
 def tracks():
     """Return the tracks of three increments of a lift, each matched from the one before."""
-    tracker = CloudTracker(Sheet(rest=sheet().rest, faces=sheet().faces), DECLARATION)
+    tracker = cloud_tracker()
     corner, x, tracks = corners()[0], sheet().rest, []
     length = jnp.asarray(np.linalg.norm(x - corner, axis=1))
     for seed, frame in enumerate(lifts()[1:4]):
         grip = Grip.of(jnp.asarray(frame.tip), length, jnp.where(length <= GRIP_RADIUS, 90.0, 0.0))
-        tracks.append(tracker.track(measured(frame.x, seed), x, 3.0 * attached(), grip))
+        tracks.append(tracker.simulated(measured(frame.x, seed), x, 3.0 * attached(), grip))
         x = tracks[-1].positions
     return tracks
 
@@ -104,11 +109,11 @@ def test_the_offset_is_the_mean_of_the_points_around_along_the_normal():
 
 
 def test_what_no_point_lies_near_is_not_seen():
-    tracker = CloudTracker(Sheet(rest=sheet().rest, faces=sheet().faces), DECLARATION)
+    tracker = cloud_tracker()
     target = cloud(sheet().rest, 0, SD)
     half = MeasuredPoints(positions=target[target[:, 0] < 0], sd=SD)
     grip = Grip.build(jnp.asarray(sheet().rest), jnp.asarray(corners()[0]), radius=GRIP_RADIUS, stiffness=90.0)
-    track = tracker.track(half, sheet().rest, np.zeros(sheet().n), grip)
+    track = tracker.simulated(half, sheet().rest, np.zeros(sheet().n), grip)
     hidden = sheet().rest[:, 0] > 0.012 + SPACING
     assert not track.visible[hidden].any() and track.visible[sheet().rest[:, 0] < 0].all()
     assert np.isnan(track.positions[hidden]).all()
@@ -154,7 +159,7 @@ def test_too_few_points_are_refused():
 
 
 def test_a_cloud_without_points_shows_no_particle():
-    tracker = CloudTracker(Sheet(rest=sheet().rest, faces=sheet().faces), DECLARATION)
+    tracker = cloud_tracker()
     nothing = MeasuredPoints(positions=np.full((100, 3), np.nan), sd=SD)
     grip = Grip.build(jnp.asarray(sheet().rest), jnp.asarray(corners()[0]), radius=GRIP_RADIUS, stiffness=90.0)
-    assert not tracker.track(nothing, sheet().rest, np.zeros(sheet().n), grip).visible.any()
+    assert not tracker.simulated(nothing, sheet().rest, np.zeros(sheet().n), grip).visible.any()
