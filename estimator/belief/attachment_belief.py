@@ -209,6 +209,8 @@ class AttachmentBelief(eqx.Module):
             self,
             (sites, shift, samples.weights),
         )
+        share = belief.prior.share_beside(samples.probability)
+        belief = eqx.tree_at(lambda belief: belief.prior.share, belief, share)
         _, log_bayes_factor = belief._mixture(*belief._cavity(belief.gaussian()))
         message = messages_with_probability(self.prior, samples.probability[0], log_bayes_factor)
         return eqx.tree_at(lambda belief: belief.message, belief, message)
@@ -296,7 +298,7 @@ class AttachmentBelief(eqx.Module):
 
     def _mixture(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> tuple[Mixture, Float[Array, " n"]]:
         """Return each particle's posterior from its cavity, and the log Bayes factor of attached without messages."""
-        return self.prior.stiffness.posterior(mean, variance, self._log_odds)
+        return self.prior.stiffness.posterior(mean, variance, self._log_odds, self.prior.share)
 
     def _match_moments(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> "AttachmentBelief":
         """Run one sweep from the cavities: match moments, pass messages, and update the component weights."""
@@ -304,17 +306,25 @@ class AttachmentBelief(eqx.Module):
         precision, shift = matching_sites(mixture, mean, variance)
         message = passed_messages(self.prior, self._log_odds + log_bayes_factor, self.message)
         damping = self.config.damping
+        share = self.prior.share_beside(mixture.weight)
 
         def damped(old: Array, new: Array) -> Array:
             return (1 - damping) * old + damping * new
 
         return eqx.tree_at(
-            lambda belief: (belief.site_precision, belief.site_shift, belief.message, belief.prior.stiffness),
+            lambda belief: (
+                belief.site_precision,
+                belief.site_shift,
+                belief.message,
+                belief.prior.share,
+                belief.prior.stiffness,
+            ),
             self,
             (
                 damped(self.site_precision, precision),
                 damped(self.site_shift, shift),
                 damped(self.message, message),
+                damped(self.prior.share, share),
                 self.prior.stiffness.learned(mixture, log_bayes_factor, rate=self.config.learning_rate),
             ),
         )

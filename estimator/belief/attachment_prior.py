@@ -4,6 +4,11 @@ A particle is free or attached (`spike_and_slab`), and the likelier attached the
 prior over the mesh [Besag 1986, doi:10.1111/j.2517-6161.1986.tb01412.x],
 
     p(attached) ~ exp(h sum_i a_i + J sum_ij a_i a_j)    a_i in {0, 1}, ij the mesh's edges.
+
+One sheet may be held softly here and rigidly there, while neighbours are about as stiff. So the component weights of a
+particle are those of its attached neighbours, with those of the whole sheet as a few neighbours more: a Polya urn
+[Blackwell & MacQueen 1973, doi:10.1214/aos/1176342372] over each neighbourhood. The shares of the components sum to 1
+whatever the neighbours have, so that the odds of being attached do not change.
 """
 
 import equinox as eqx
@@ -22,6 +27,10 @@ class AttachmentPrior(eqx.Module):
     """Prior of each particle's s."""
     log_odds: Float[Array, " n"]
     """Log odds h of a particle without attached neighbours; equal for all, except where something was cut or sewn."""
+    share: Float[Array, "_components n"]
+    """Probability of each component of each particle if it is attached, by those of its neighbours."""
+    sheet_strength: Float[Array, ""]
+    """Number of attached neighbours that the component weights of the whole sheet are worth."""
     coupling: Float[Array, ""]
     """Coupling J, which each attached neighbour adds to the log odds."""
     neighbours: Int[Array, "n d"]
@@ -38,16 +47,43 @@ class AttachmentPrior(eqx.Module):
         stiffness: SpikeAndSlab,
         probability: float,
         coupling: float,
+        sheet_strength: float = np.inf,
     ) -> "AttachmentPrior":
-        """Return the prior of n particles; `probability` is P(attached) of one without attached neighbours."""
+        """Return the prior of a mesh.
+
+        Args:
+            n: number of particles.
+            edges: of the mesh.
+            stiffness: prior of each particle's s.
+            probability: P(attached) of a particle without attached neighbours.
+            coupling: J.
+            sheet_strength: attached neighbours that the component weights of the whole sheet are worth; by default the
+                neighbours do not count.
+        """
         table = neighbour_table(symmetric(n, edges))
         return cls(
             stiffness=stiffness,
             log_odds=jnp.full(n, np.log(probability) - np.log1p(-probability)),
+            share=jnp.repeat(stiffness.share[:, None], n, axis=1),
+            sheet_strength=jnp.asarray(sheet_strength, dtype=float),
             coupling=jnp.asarray(coupling, dtype=float),
             neighbours=jnp.asarray(np.where(table < 0, n, table)),
             back=jnp.asarray(reverse_places(table)),
         )
+
+    def share_beside(self, probability: Float[Array, "c n"]) -> Float[Array, "_components n"]:
+        """Return the probability of each component of each particle if attached, by those of its neighbours.
+
+        Args:
+            probability: of each component of each particle; the first is free.
+        """
+        whole = jnp.pad(self.stiffness.source @ probability[1:], ((0, 0), (0, 1)))
+        return self.share_among(jnp.sum(whole[:, self.neighbours], axis=2))
+
+    def share_among(self, count: Float[Array, "_components m"]) -> Float[Array, "_components m"]:
+        """Return the probability of each component beside so many attached neighbours with all of each attachment."""
+        weights, total = self.stiffness.weights[:, None], jnp.sum(count, axis=0, keepdims=True)
+        return self.stiffness.border_kernel @ (weights + (count - total * weights) / (self.sheet_strength + total))
 
     def isolated(
         self, region: Bool[Array, " n"], probability: Float[Array, " n"], message: Float[Array, "n d"]

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from .attachment_prior import AttachmentPrior
 from .config import SamplerConfig
 from .gaussian_information import GaussianInformation
+from .spike_and_slab import SpikeAndSlab
 
 MIN_PRECISION = 1e-8
 """Smallest precision of the evidence about one particle's s, where rounding could make it negative; s is in [0, 1]."""
@@ -88,7 +89,7 @@ class Sampler(eqx.Module):
         def sweep(k, state):
             component, moments, stiffness, sums = state
             by_component, by_weights = jax.random.split(jax.random.fold_in(key, k))
-            component, moments, probability = self.sweep(component, moments, stiffness.share, by_component)
+            component, moments, probability = self.sweep(component, moments, stiffness, by_component)
             stiffness, mean = stiffness.drawn(component, by_weights), moments.mean
             squared = jnp.diagonal(moments.covariance) + mean**2
             sums = jax.tree.map(
@@ -135,12 +136,12 @@ class Sampler(eqx.Module):
         Iterated conditional modes [Besag 1986, JRSS B 48:259] from the given components, with the weights of the prior:
         no other component of a single particle is likelier. `SamplerConfig.sweeps_per_round` sweeps at most.
         """
-        share = self.prior.stiffness.share
+        stiffness = self.prior.stiffness
 
         def sweep(state):
             before, moments, count, _ = state
             by_order = jax.random.fold_in(key, count)
-            component, moments, _ = self.sweep(before, moments, share, by_order, likeliest=True)
+            component, moments, _ = self.sweep(before, moments, stiffness, by_order, likeliest=True)
             return component, moments, count + 1, jnp.any(component != before)
 
         def changing(state):
@@ -166,7 +167,7 @@ class Sampler(eqx.Module):
         self,
         component: Int[Array, " n"],
         moments: Moments,
-        share: Float[Array, " _components"],
+        stiffness: SpikeAndSlab,
         key: PRNGKeyArray,
         *,
         likeliest: bool = False,
@@ -176,7 +177,7 @@ class Sampler(eqx.Module):
         Args:
             component: that of each particle before.
             moments: `moments` of these components.
-            share: `SpikeAndSlab.share`.
+            stiffness: prior of s, with the weights of the whole sheet as drawn last.
             key: random numbers of the order and the draws.
             likeliest: take the likeliest component of each particle instead of a draw.
 
@@ -187,7 +188,7 @@ class Sampler(eqx.Module):
         by_order, by_noise = jax.random.split(key)
         order, noise = jnp.argsort(jax.random.permutation(by_order, n)), jax.random.gumbel(by_noise, (c, n))
         noise = jnp.zeros_like(noise) if likeliest else noise
-        change = self._change(jnp.append(order, jnp.full(self.config.candidates, n)), noise, share)
+        change = self._change(jnp.append(order, jnp.full(self.config.candidates, n)), noise, stiffness)
 
         def batch(state):
             component, moments, probability, position = state
@@ -200,19 +201,19 @@ class Sampler(eqx.Module):
         first = component, moments, jnp.zeros((c, n)), jnp.asarray(0)
         return jax.lax.while_loop(lambda state: state[-1] < n, batch, first)[:3]
 
-    def _change(
-        self, order: Int[Array, " _padded"], noise: Float[Array, "c n"], share: Float[Array, " _components"]
-    ) -> Callable:
+    def _change(self, order: Int[Array, " _padded"], noise: Float[Array, "c n"], stiffness: SpikeAndSlab) -> Callable:
         """Return the step of a sweep: draw particles up to and including the next one that changes its component.
 
         Args:
             order: particles in the order of the sweep, padded with n.
             noise: Gumbel noise of each draw; 0 takes the likeliest.
-            share: `SpikeAndSlab.share`.
+            stiffness: prior of s, with the weights of the whole sheet as drawn last.
         """
         n, candidates = noise.shape[1], self.config.candidates
         centre, width = self.prior.stiffness.mean[:, None], self.prior.stiffness.sd[:, None] ** 2
         precision, shift = self._normals
+        prior = eqx.tree_at(lambda prior: prior.stiffness, self.prior, stiffness)
+        source = jnp.pad(stiffness.source, ((0, 0), (1, 0)))
 
         def change(state):
             component, mean, variance, pending, probability, position = state
@@ -226,11 +227,11 @@ class Sampler(eqx.Module):
                 total * cavity_variance * width
             )
             log_above_zero = log_ndtr(posterior_ratio[1:])
-            attached = jnp.append(jnp.where(component > 0, 1.0, 0.0), 0.0)
-            attached_neighbours = jnp.sum(attached[self.prior.neighbours[i]], axis=1)
-            log_odds = self.prior.log_odds[i] + self.prior.coupling * attached_neighbours
+            beside = jnp.sum(source[:, jnp.append(component, 0)[prior.neighbours[i]]], axis=2)
+            share, attached_neighbours = prior.share_among(beside), jnp.sum(beside, axis=0)
+            log_odds = prior.log_odds[i] + prior.coupling * attached_neighbours
             log_likelihood = -0.5 * (cavity_mean - centre) ** 2 / total - 0.5 * jnp.log(total)
-            log_weight = log_likelihood.at[1:].add(jnp.log(share)[:, None] + log_odds[None] + log_above_zero)
+            log_weight = log_likelihood.at[1:].add(jnp.log(share) + log_odds[None] + log_above_zero)
             drawn = jnp.argmax(log_weight + noise[:, i], axis=0)
             changes = (drawn != old) & (drawn_now < n)
             last = jnp.where(jnp.any(changes), jnp.argmax(changes), candidates - 1)

@@ -23,6 +23,9 @@ class PriorConfig:
     dirichlet_strength: float = 3.0
     """Number of attached particles that the equal weights of the components are worth when the weights are learned
     [particles]; see `SpikeAndSlab.dirichlet_strength`."""
+    sheet_strength: float = 1.0
+    """Number of attached neighbours that the component weights of the whole sheet are worth beside the neighbours' own
+    [particles]: inside a patch six in seven attachments are like their neighbours. See `AttachmentPrior.share`."""
     partial: float = 0.4
     """Share of attached particles that have only a part of an attachment, as at a border [1]. It is measured where two
     meshes represent the attachments of the shipped scenes."""
@@ -36,7 +39,7 @@ class PriorConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_ranges(self, positive=("spike", "spread", "dirichlet_strength"))
+        check_ranges(self, positive=("spike", "spread", "dirichlet_strength", "sheet_strength"))
         for name in ("partial", "probability"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"PriorConfig.{name} must lie between 0 and 1; got {getattr(self, name)}.")
@@ -73,5 +76,6 @@ def prior_belief(
         stiffness=stiffness_prior(config),
         probability=config.probability,
         coupling=config.coupling,
+        sheet_strength=config.sheet_strength,
     )
     return AttachmentBelief.before(prior, reference=reference, config=belief)

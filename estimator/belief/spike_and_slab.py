@@ -6,8 +6,9 @@ truncated to [0, 1]. The product of each with a Gaussian measurement is a trunca
 quantiles are closed forms.
 
 The weights of the components are learned from the particles that are called attached, as attachments of one tissue
-resemble each other. An attachment that ends between two particles leaves the one at its border any part of the
-stiffness that the others have; `SpikeAndSlab.border_kernel` is the distribution of that part.
+resemble each other; `attachment_prior` has how those of one particle follow its neighbours. An attachment that ends
+between two particles leaves the one at its border any part of the stiffness that the others have;
+`SpikeAndSlab.border_kernel` is the distribution of that part.
 """
 
 import equinox as eqx
@@ -122,6 +123,11 @@ class SpikeAndSlab(eqx.Module):
         """Return the probability of each component of an attached particle."""
         return self.border_kernel @ self.weights
 
+    @property
+    def source(self) -> Float[Array, "_components _components"]:
+        """Return the probability of each component with all of the attachment (row), given the particle's (column)."""
+        return self.weights[:, None] * self.border_kernel.T / self.share[None]
+
     def learned(self, mixture: Mixture, log_bayes_factor: Float[Array, " n"], *, rate: float) -> "SpikeAndSlab":
         """Update the weights by a damped step of expectation maximisation with a Dirichlet prior.
 
@@ -136,7 +142,7 @@ class SpikeAndSlab(eqx.Module):
         """
         counted = (mixture.attached > 0.5) & (log_bayes_factor > 0)
         count = jnp.sum(jnp.where(counted, mixture.weight[1:], 0.0), axis=1)
-        count = self.weights * (self.border_kernel.T @ (count / self.share))
+        count = self.source @ count
         weights = (self.dirichlet_strength / len(count) + count) / (self.dirichlet_strength + jnp.sum(count))
         return eqx.tree_at(lambda prior: prior.weights, self, (1 - rate) * self.weights + rate * weights)
 
@@ -150,7 +156,11 @@ class SpikeAndSlab(eqx.Module):
         return eqx.tree_at(lambda prior: prior.weights, self, weights)
 
     def posterior(
-        self, mean: Float[Array, " n"], variance: Float[Array, " n"], log_odds: Float[Array, " n"]
+        self,
+        mean: Float[Array, " n"],
+        variance: Float[Array, " n"],
+        log_odds: Float[Array, " n"],
+        share: Float[Array, "_components n"] | None = None,
     ) -> tuple[Mixture, Float[Array, " n"]]:
         """Return the posterior after a measurement of each s, and the log Bayes factor of attached against free.
 
@@ -158,6 +168,7 @@ class SpikeAndSlab(eqx.Module):
             mean: measured s, which may lie outside of [0, 1].
             variance: variance of the measurement.
             log_odds: log odds of attached before it.
+            share: probability of each component of each particle if it is attached, before it; None for `share`.
         """
         centre, width = self.mean[:, None], self.sd[:, None] ** 2
         mean, variance = mean[None], variance[None]
@@ -165,7 +176,7 @@ class SpikeAndSlab(eqx.Module):
         parts = Mixture(weight=combined, mean=combined * (mean / variance + centre / width), sd=jnp.sqrt(combined))
         log_likelihood = norm.logpdf(mean, centre, jnp.sqrt(variance + width))
         evidence = log_likelihood + _log_mass_inside(parts.mean, parts.sd) - _log_mass_inside(centre, self.sd[:, None])
-        components = evidence[1:] + jnp.log(self.share)[:, None]
+        components = evidence[1:] + jnp.log(self.share[:, None] if share is None else share)
         log_bayes_factor = logsumexp(components, axis=0) - evidence[0]
         attached = jax.nn.sigmoid(log_odds + log_bayes_factor)[None]
         weight = jnp.concatenate([1 - attached, attached * jax.nn.softmax(components, axis=0)])

@@ -76,7 +76,7 @@ def _sewn(belief: AttachmentBelief, where: Bool[Array, " n"], stiffness: Float[A
     changed = belief.changed(where, _clipped(1 - FAILURE_PROBABILITY * (1 - attached)))
     intended = belief.bounded(jnp.full(len(where), stiffness))
     odds = changed.prior.log_odds
-    _, log_bayes_factor = changed.prior.stiffness.posterior(intended, intended**2, odds)
+    _, log_bayes_factor = changed.prior.stiffness.posterior(intended, intended**2, odds, changed.prior.share)
     changed = eqx.tree_at(
         lambda belief: belief.prior.log_odds, changed, jnp.where(where, odds - log_bayes_factor, odds)
     )

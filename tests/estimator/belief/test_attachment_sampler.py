@@ -120,7 +120,7 @@ def test_a_sweep_keeps_the_moments_up_to_date():
     chain = sampler(0.06)
     component = jnp.array([1, 2, 0, 0, 2])
     after, moments, _ = eqx.filter_jit(chain.sweep)(
-        component, chain.moments(component), chain.prior.stiffness.share, jax.random.key(3)
+        component, chain.moments(component), chain.prior.stiffness, jax.random.key(3)
     )
     assert (after != component).any()
     expected = chain.moments(after)
@@ -134,7 +134,7 @@ def test_settings_of_speed_do_not_change_the_draws(setting):
     plain, component = sampler(0.06), jnp.array([1, 2, 0, 0, 2])
     other = Sampler(prior=plain.prior, precision=plain.precision, shift=plain.shift, config=SamplerConfig(**setting))
     (expected, moments, weight), (found, others, others_weight) = (
-        eqx.filter_jit(chain.sweep)(component, chain.moments(component), chain.prior.stiffness.share, jax.random.key(3))
+        eqx.filter_jit(chain.sweep)(component, chain.moments(component), chain.prior.stiffness, jax.random.key(3))
         for chain in (plain, other)
     )
     np.testing.assert_array_equal(found, expected)
@@ -154,6 +154,32 @@ def test_component_weights_are_learned_from_attached_particles():
     found = sampled(0.6, dirichlet_strength=1.0)
     assert float(found.weights[1]) > 0.7
     assert float(jnp.sum(found.weights)) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("by", ["samples", "propagation"])
+def test_what_was_not_seen_is_as_stiff_as_its_neighbours(by):
+    """A row, stiff at one end and soft at the other, both measured; of each half the particle inside was not seen. That
+    does not change how likely those are attached. With an equal share the first would be stiff with a chance of 1/2."""
+    edges, mean = np.column_stack([np.arange(5), np.arange(1, 6)]), jnp.array([0.3, 0.3, 0.0, 0.0, 0.03, 0.03])
+    precision, found = jnp.array([1e4, 1e4, 0.0, 0.0, 1e6, 1e6]), []
+    for strength in (0.25, np.inf):
+        stiffness = SpikeAndSlab.build(
+            spike=3e-3, components=(0.03, 0.3), spread=0.3, dirichlet_strength=1e12, partial=0.0
+        )
+        prior = AttachmentPrior.build(
+            6, edges, stiffness=stiffness, probability=0.5, coupling=2.0, sheet_strength=strength
+        )
+        belief = AttachmentBelief.before(prior, reference=1.0).add(jnp.diag(precision), precision * mean)
+        if by == "samples":
+            belief, agree = eqx.filter_jit(belief.sampled)(jax.random.key(0), burn_in=3, rounds=300)
+            assert agree
+        else:
+            belief = eqx.filter_jit(belief.swept)(30)
+        found.append(np.asarray(belief.mixture().weight))
+    alike, equal = (weight[2, 2:4] / weight[1:, 2:4].sum(axis=0) for weight in found)
+    assert alike[0] > 0.65 and alike[1] < 0.35
+    np.testing.assert_allclose(equal, 0.5, atol=PROBABILITY_ERROR)
+    np.testing.assert_allclose(*(weight[0, 2:4] for weight in found), atol=PROBABILITY_ERROR)
 
 
 def test_particles_that_the_evidence_pulls_below_zero_are_free():
