@@ -286,10 +286,18 @@ class AttachmentBelief(eqx.Module):
         Neighbouring particles share an attachment that lies between them, and a spring at each of them lets the sheet
         rotate about another point than the attachment does. So the share that fits the frames best is not the share by
         virtual work, in all grasps alike. The sum of s is not affected.
+
+        A soft attachment that ends between two particles acts on both by virtual work. A rigid one does not: its rim is
+        a hinge, and a particle just outside of the rim may move like a free one though the nearest part is rigid. So
+        the share of the difference that belongs to the other is known there only to be in [0, 1]; it enters in
+        proportion to how rigid the two are.
         """
         s = jnp.append(jnp.clip(s, 0, 1), 0.0)
-        between = (s[:-1, None] + s[self.prior.neighbours]) / 2
-        variance = (self.config.mesh_transfer * between * (1 - between)) ** 2
+        own, other = s[:-1, None], s[self.prior.neighbours]
+        between = (own + other) / 2
+        inside = self.config.mesh_transfer * between * (1 - between)
+        rim = self.config.rim_transfer * (own - other) * (own + other)
+        variance = inside**2 + rim**2
         return jnp.where(self.prior.neighbours < len(self.shift), variance, 0.0)
 
     def _cavity(self, gaussian: Gaussian) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

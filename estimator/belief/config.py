@@ -50,6 +50,9 @@ class BeliefConfig:
     cloud_mesh_transfer: float = 0.3
     """The same for clouds without identities: they show where the sheet bends, and not which of two neighbours bends
     it. Chosen on one recording each of `arc` and `line`."""
+    rim_transfer: float = 12**-0.5
+    """The same share where a rigid attachment ends between two neighbours: that of a rim of which only is known that it
+    lies between them. It is scaled by the difference of their s and by their sum, as a soft attachment acts on both."""
     open_above: float = 0.9
     """Bounded stiffness above which the upper end of an interval is infinite: nine times b_ref and a weld
     differ by less than the mesh resolves."""
@@ -62,7 +65,7 @@ class BeliefConfig:
         """Check types and ranges."""
         shares = ("damping", "learning_rate", "open_above")
         check_ranges(self, positive=shares, shares=shares)
-        for name in ("mesh_transfer", "cloud_mesh_transfer"):
+        for name in ("mesh_transfer", "cloud_mesh_transfer", "rim_transfer"):
             as_number(getattr(self, name), f"BeliefConfig.{name}", at_least=0)
         as_number(self.tail, "BeliefConfig.tail", above=0, below=0.5)
         check_parts(self)

@@ -17,6 +17,7 @@ COMPONENTS, SPREAD = (0.03, 0.3), 0.5
 STIFFNESS = SpikeAndSlab.build(spike=3e-3, components=COMPONENTS, spread=SPREAD, dirichlet_strength=1e12, partial=0.0)
 """With so many equal particles beforehand that the weights stay as they are."""
 PROBABILITY, REFERENCE = 0.1, 30.0
+NO_TRANSFER = BeliefConfig(mesh_transfer=0.0, rim_transfer=0.0)
 CONVERGED = 1e-6
 """Relative; error of a fixed point after 30 damped sweeps."""
 EP_ERROR = 0.05
@@ -44,7 +45,7 @@ def alone(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def test_independent_measurements_give_each_particle_its_own_posterior():
     mean, variance = np.array([0.0, 0.02, 0.15, 0.9]), np.array([1e-5, 1e-4, 1e-4, 1e-2])
-    belief = chain(4, coupling=0.0, config=BeliefConfig(mesh_transfer=0.0))
+    belief = chain(4, coupling=0.0, config=NO_TRANSFER)
     belief = swept(belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance)), 30)
     expected, spread = alone(mean, variance)
     found = posterior(belief)
@@ -111,7 +112,8 @@ def test_an_attached_neighbour_raises_the_odds():
 
 def test_intervals_open_upwards_where_only_a_lower_end_is_known():
     mean, sd = np.array([0.0, 0.1, 0.99]), np.array([1e-3, 5e-3, 5e-2])
-    belief = swept(chain(3, coupling=0.0).add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2)), 30)
+    belief = chain(3, coupling=0.0, config=NO_TRANSFER)
+    belief = swept(belief.add(jnp.diag(jnp.asarray(sd**-2)), jnp.asarray(mean / sd**2)), 30)
     lower, upper = (np.asarray(end) for end in interval(belief))
     assert lower[0] == 0 and upper[0] < REFERENCE * 0.01
     assert lower[1] < REFERENCE * 0.1 / 0.9 < upper[1] < np.inf
@@ -123,7 +125,7 @@ def test_transfer_by_the_mesh_adds_to_each_variance_and_leaves_sums_unchanged():
     mean, variance = np.array([0.0, 0.1, 0.0]), np.full(3, 1e-6)
     summary = []
     for transfer in (0.0, 1 / 3):
-        belief = chain(3, coupling=0.0, config=BeliefConfig(mesh_transfer=transfer))
+        belief = chain(3, coupling=0.0, config=BeliefConfig(mesh_transfer=transfer, rim_transfer=0.0))
         belief = belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance))
         summary.append((np.asarray(moments(belief)[1]), posterior(belief).sd, interval(belief)))
     (sharp, sharp_sd, sharp_interval), (wide, wide_sd, wide_interval) = summary
@@ -135,6 +137,20 @@ def test_transfer_by_the_mesh_adds_to_each_variance_and_leaves_sums_unchanged():
     np.testing.assert_allclose(wide_sd**2 - sharp_sd**2, np.diagonal(edges.T @ edges), rtol=1e-6)
     assert float(wide_interval[0][1]) < float(sharp_interval[0][1]) < float(sharp_interval[1][1])
     assert (np.asarray(wide_interval[1]) > np.asarray(sharp_interval[1])).all()
+
+
+def test_a_particle_at_the_rim_of_a_weld_may_have_any_stiffness():
+    """Measured as nearly free beside a weld, its deviation is that of a share in [0, 1]; not so beside a soft one."""
+    mean, variance = np.array([0.9, 0.05, 0.0, 0.05, 0.1]), np.full(5, 1e-6)
+    belief = chain(5, coupling=0.0, config=BeliefConfig(mesh_transfer=0.0))
+    belief = belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance))
+    sd = np.asarray(posterior(belief).sd)
+    assert sd[1] == pytest.approx((0.9**2 - 0.05**2) / np.sqrt(12), rel=1e-2)
+    assert sd[3] < 0.05 / 10
+    assert float(jnp.sum(moments(belief)[1])) == pytest.approx(variance.sum(), rel=1e-2)
+    lower, upper = (np.asarray(end) for end in interval(belief))
+    measured = REFERENCE * 0.05 / 0.95
+    assert lower[1] < measured / 2 and upper[1] > 5 * measured
 
 
 def test_stiffness_and_its_bounded_form_are_inverse():
