@@ -32,6 +32,9 @@ FORCE_VARIANCE = 0.04
 grasp. Measured: the likeliest on recordings of the reference with nothing undeclared."""
 AMPLITUDE = 0.2
 """Standard deviation of the smooth force fields [force errors]; the likeliest on the same recordings."""
+SHEET_STRENGTH = 1e9
+"""Attached neighbours that the whole sheet is worth [particles]; see `PriorConfig.sheet_strength`. Here all attachments
+resemble each other, as they did when the limits of the decisions were chosen."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,11 +67,12 @@ class Problem:
         balance = force_balance(mesh, energy, estimator.declaration, config).inflated(FORCE_VARIANCE)
         library = tuple(effect for effect in library if estimator.declaration.hangs or not effect.hanging)
         sheet = PredictedSheet(balance=balance, view=centred(mesh), library=library)
+        alike = replace(config.prior, sheet_strength=SHEET_STRENGTH)
         own = {name: sd for name, sd in NUISANCE.items() if any(effect.name == name for effect in library)}
         return cls(
             sheet=sheet,
             history=FrameHistory(dataset.frames, mesh.rest),
-            prior=prior_belief(mesh, reference=float(balance.reference), config=config.prior, belief=config.belief),
+            prior=prior_belief(mesh, reference=float(balance.reference), config=alike, belief=config.belief),
             noise=dataset.fields,
             prior_sd=np.concatenate([np.tile(effect.prior_sd, effect.sites) for effect in library]),
             own=np.concatenate([[], *(sheet.place(name) for name in own)]).astype(int),

@@ -211,8 +211,7 @@ class ForceBalance(eqx.Module):
         self, x: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
     ) -> tuple[Frame, Fit, FrameInformation]:
         """Return a frame linearised at a state near x [m], its fit, and its evidence about s, as one program."""
-        frame = self.approach(x, s, evidence)
-        fit = self.fit(frame)
+        fit = self.fit(frame := self.approach(x, s, evidence))
         return frame, fit, self.information(frame, fit)
 
     def settled_evidence(

@@ -146,7 +146,7 @@ def test_steps_end_where_the_cost_has_no_slope(balance):
     seen = sharing(white)
     frame = eqx.filter_jit(balance.approach)(jnp.asarray(lifts()[3].x), s, seen)
     for _ in range(30):
-        x = eqx.filter_jit(balance.polish)(frame, s, seen)
+        x = eqx.filter_jit(balance.polish)(frame, s)
         frame = eqx.filter_jit(balance.linearise)(x, s, seen)
     R = np.zeros((3 * N, 3 * N))
     for i, precision in enumerate(np.asarray(white.precision)):

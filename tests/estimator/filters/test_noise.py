@@ -32,10 +32,11 @@ def drawn(request: pytest.FixtureRequest) -> list[ForceResiduals]:
         smooth = jax.random.normal(draw, (6, 3))
         sd = jnp.where(frame.weight > 0, 1 / jnp.sqrt(frame.weight), 0.0)
         seen_sd = 1 / jnp.sqrt(seen.white_precision[:, 0, 0])
-        parts = sd[:, None] * own, seen_sd[:, None] * others
+        innovation = seen_sd[:, None] * others
         if seen.fields is not None:
-            parts = parts[0], parts[1] + seen.seen_fields @ smooth
-        off_balance = eqx.tree_at(lambda one: (one.unbalanced, one.innovation), frame, parts)
+            innovation = innovation + seen.seen_fields @ smooth
+        y = jnp.where(seen.seen[:, None], frame.x + innovation, 0.0)
+        off_balance = eqx.tree_at(lambda one: (one.unbalanced, one.evidence.y), frame, (sd[:, None] * own, y))
         return balance.residuals(off_balance, balance.fit(off_balance))
 
     return [residuals(balance, key) for key in jax.random.split(jax.random.key(0), DRAWS)]

@@ -14,7 +14,7 @@ from tests.support.small_sheet import DECLARATION, SPACING, cloud, lifts, sheet
 SD = 2e-4
 """Noise of a point [m]."""
 STEP = 1e-7
-"""Of central differences of a quadratic [m]: their rounding is below 1e-6 of it."""
+"""Step of central differences of a quadratic [m]: their rounding is below 1e-6 of it."""
 STILL = [cloud(sheet().rest, seed, SD) for seed in range(10)]
 SURFACE = CloudSurface.build(sheet(), STILL, sd=SD)
 NONE_HELD = jnp.zeros(sheet().n, bool)
@@ -63,7 +63,7 @@ def test_the_outline_shows_how_the_sheet_slides(shift):
     """Once the sheet is moved to where it is seen, within the standard deviations that the precisions claim."""
     errors = []
     for seed in range(20, 30):
-        found = np.zeros(2)
+        found, covariance = np.zeros(2), np.eye(2)
         for _ in range(4):
             x = sheet().rest + np.append(found, 0)
             pull, precision = look(cloud(sheet().rest, seed, SD) + np.append(shift, 0), x)
