@@ -32,6 +32,9 @@ KEYS = {
         **dict.fromkeys(("perception_s", "plan_s", "simulation_s")),
     },
 }
+NOISE_OF_POINTS = dict.fromkeys(("from", "point_sd_m", "smooth_sd_m", "smooth_length_m", "stated_sd_m", "still_frames"))
+KEYS_OF_POINTS = KEYS | {"noise": KEYS["noise"] | {"points": NOISE_OF_POINTS}}
+"""Keys where points were measured; of images `noise.points` is null."""
 
 
 def keys(value: object) -> object:

@@ -24,7 +24,7 @@ from jiggle_mj.limits import Limits
 from jiggle_mj.observation import Declaration
 from jiggle_mj.options import POLICIES
 from jiggle_mj.scenes import Reference, load_scene, programme
-from tests.support.result_keys import KEYS, keys
+from tests.support.result_keys import KEYS_OF_POINTS, keys
 from tests.support.tiny_scene import SCENE, call, scene_file
 
 DISC_RADIUS = 12e-3
@@ -245,8 +245,8 @@ def test_a_run_with_a_policy_writes_all_and_counts_frames_over_the_limits(tmp_pa
     arguments = ("--sensing", "particles", "--policy", "pmp-up", "--steps", 3, "--json")
     assert call(monkeypatch, "run", path, "--out", tmp_path / "out", *arguments) == 0
     figures = json.loads(capsys.readouterr().out)
-    changed = {"settings": KEYS["settings"] | {"estimator": {"refinement": None}}}  # as a policy needs it
-    assert keys(figures) == KEYS | changed
+    changed = {"settings": KEYS_OF_POINTS["settings"] | {"estimator": {"refinement": None}}}  # as a policy needs it
+    assert keys(figures) == KEYS_OF_POINTS | changed
     assert figures["policy"] == "pmp-up" and figures["ended"] == "all 3 steps are done"
     assert [decision["does"][:7] for decision in figures["decisions"]] == ["move to"] * 3
     assert "Actions and reasons" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -289,7 +289,7 @@ def test_a_procedure_cuts_what_is_found_and_says_whether_it_worked(tmp_path, fai
     planner = Detach(lambda **_: Corners())
     figures: Any = run_scene(scene, tmp_path / "out", sensing="particles", policy="detach", planner=planner, steps=60)
     done = figures["procedure"]
-    assert keys(figures) == KEYS | {"procedure": dict.fromkeys(("name", "cycles", "success", "acts"))}
+    assert keys(figures) == KEYS_OF_POINTS | {"procedure": dict.fromkeys(("name", "cycles", "success", "acts"))}
     assert done["name"] == "detach" and done["success"] is not fails
     for act in done["acts"][:-1] if fails else done["acts"]:
         assert act["kind"] == "cut" and act["succeeded"] is not fails
