@@ -112,8 +112,8 @@ class CloudTracker:
         """Prepare the mesh, and measure the clouds of the sheet at rest."""
         self._mesh, self._config = SheetMesh(sheet.rest, sheet.faces), config or CloudTrackerConfig()
         self._declaration, self._neighbourhood = declaration, self._config.neighbourhood * self._mesh.spacing
-        finite = [points.positions[np.isfinite(points.positions).all(axis=1)] for points in still]
-        self._surface = CloudSurface.build(self._mesh, finite, sd=still[0].sd)
+        clouds = [self._finite(points) for points in still]  # as dense as later ones, or the outline would seem to move
+        self._surface = CloudSurface.build(self._mesh, clouds, sd=still[0].sd)
 
     def unmatched(self, points: MeasuredPoints) -> Track:
         """Return a cloud that the filter is to match; `matched` says afterwards what it shows.

@@ -130,3 +130,16 @@ def test_a_cloud_of_something_else_is_refused():
     assert track.cloud is not None and np.isfinite(track.cloud.points).all(axis=1).sum() == 3000
     shown = matched(track.cloud, sheet().rest, np.zeros(sheet().n, bool))
     assert shown.visible.all() and np.abs(shown.positions - sheet().rest)[inner()].max() < SD
+
+
+def test_dense_clouds_move_the_outline_by_no_more_than_its_noise():
+    """Clouds at rest are thinned as later ones are: else their points would lie nearer to the edge."""
+    dense = [np.concatenate([cloud(sheet().rest, 50 + 20 * k + j, SD) for j in range(20)]) for k in range(4)]
+    laid = Sheet(rest=sheet().rest, faces=sheet().faces)
+    tracker = CloudTracker(laid, DECLARATION, [MeasuredPoints(positions=still, sd=SD) for still in dense[:3]])
+    track = tracker.unmatched(MeasuredPoints(positions=dense[3], sd=SD))
+    assert track.cloud is not None
+    _, beyond, weight = track.cloud._edges(jnp.asarray(sheet().rest), jnp.asarray(4 * SD))
+    shown = np.asarray(weight) > 0
+    sd = float(track.cloud.surface.gap_sd) * np.sqrt(1 + 1 / 3)  # the gaps are the mean of three clouds
+    assert abs(np.asarray(beyond)[shown].mean()) < 3 * sd / np.sqrt(shown.sum())
