@@ -168,7 +168,7 @@ class ForceBalance(eqx.Module):
         unbalanced = self.config.smooth_force if unbalanced is None else unbalanced
         b, sd = self.reference * s / (1 - s), self.config.force_sd_floor * self.force_sd
         tolerance, stiff = unbalanced * sd, self.grip_stiffness
-        for gate in CLOUD_GATES if evidence.cloud is not None else CLOUD_GATES[-1:]:
+        for gate in (0.0,) if evidence.cloud is None else CLOUD_GATES:
             near = evidence.near(x, gate=gate)
             x = self.tethered.settle(b, near, x, force_sd=sd, force_tolerance=tolerance, grip_stiffness=stiff).x
         return x

@@ -124,11 +124,9 @@ class CloudTracker:
         cloud = self._finite(points)
         if len(cloud) < self._config.min_points:
             raise PerceptionError(f"the cloud has {len(cloud)} points; a sheet needs {self._config.min_points}.")
-        padded = np.full((self._config.samples, 3), np.nan)
-        padded[: len(cloud)] = cloud
         sd = jnp.asarray(points.sd)
         return Track.of_nothing(
-            self._mesh.n, Cloud(surface=self._surface, points=jnp.asarray(padded), sd=sd, sd_ratio=jnp.ones_like(sd))
+            self._mesh.n, Cloud(surface=self._surface, points=self._padded(cloud), sd=sd, sd_ratio=jnp.ones_like(sd))
         )
 
     def simulated(
@@ -145,9 +143,7 @@ class CloudTracker:
         cloud = self._finite(points)
         if not len(cloud):
             return Track.of_nothing(len(before))
-        padded = np.full((self._config.samples, 3), np.nan)
-        padded[: len(cloud)] = cloud
-        state = jnp.asarray(before), jnp.asarray(b), grip, jnp.asarray(padded)
+        state = jnp.asarray(before), jnp.asarray(b), grip, self._padded(cloud)
         x = np.asarray(_matched(*self._simulator, *state, self._config))
         normal = trimesh.Trimesh(x, self._mesh.faces, process=False).vertex_normals
         height = offset(x, normal, cloud, self._neighbourhood)
@@ -174,6 +170,11 @@ class CloudTracker:
         few = min(len(cloud), self._config.samples)
         return cloud[np.linspace(0, len(cloud), few, endpoint=False).astype(int)]
 
+    def _padded(self, cloud: Float[np.ndarray, "q 3"]) -> Float[Array, "p 3"]:
+        """Return a cloud as `CloudTrackerConfig.samples` rows, NaN behind its own, so that one program serves all."""
+        rows = self._config.samples - len(cloud)
+        return jnp.asarray(np.pad(cloud, ((0, rows), (0, 0)), constant_values=np.nan))
+
 
 def matched(cloud: Cloud, x: Float[np.ndarray, "n 3"], held: Bool[np.ndarray, " n"]) -> Track:
     """Return what a cloud shows of the particles, once the state is known [m]; they lie within a spacing of it.
@@ -181,19 +182,27 @@ def matched(cloud: Cloud, x: Float[np.ndarray, "n 3"], held: Bool[np.ndarray, " 
     Raises:
         PerceptionError: most of the points lie off the sheet.
     """
-    belongs, known = np.asarray(cloud.belongs(jnp.asarray(x))), np.isfinite(cloud.points).all(axis=1)
+    belongs, pull, precision = (np.asarray(part) for part in _shown(cloud, jnp.asarray(x), jnp.asarray(held)))
+    known = np.isfinite(cloud.points).all(axis=1)
     share = belongs.sum() / max(int(known.sum()), 1)
     if share < MIN_SHARE:
         raise PerceptionError(
             f"{share:.0%} of the cloud's points lie on the sheet, and {MIN_SHARE:.0%} are needed: the cloud is of "
             "something else, or shows more than the sheet (crop it), or is in another frame or unit."
         )
-    pull, precision = (np.asarray(part) for part in cloud.matched(jnp.asarray(x), jnp.asarray(held)))
     covariance = np.linalg.inv(precision + np.eye(3) / float(cloud.surface.spacing) ** 2)
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
     seen = np.trace(precision, axis1=1, axis2=2) > 0
     moved = np.einsum("nij,nj->ni", covariance, pull)
     return Track(positions=np.where(seen[:, None], x + moved, np.nan), covariance=covariance, visible=seen)
+
+
+@eqx.filter_jit
+def _shown(
+    cloud: Cloud, x: Float[Array, "n 3"], held: Bool[Array, " n"]
+) -> tuple[Bool[Array, " q"], Float[Array, "n 3"], Float[Array, "n 3 3"]]:
+    """Return which points lie on the sheet, and what they say of its particles, as one program."""
+    return cloud.belongs(x), *cloud.matched(x, held)
 
 
 def offset(

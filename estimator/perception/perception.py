@@ -205,14 +205,12 @@ class Perception:
         if all(points.track_id is not None for points in self._still):
             return self._points.start(self._still)
         declared = self._declaration.mesh
-        if declared is not None:
-            refuse_many_particles(len(declared.vertices), MESH_CAUSE)
-        sheet = (
-            lay_mesh(self._still, spacing=self._spacing, config=self._config.clouds)
-            if declared is None
-            else Sheet(rest=declared.vertices, faces=declared.faces)
-        )
-        refuse_many_particles(len(sheet.rest), f"a mesh over the clouds at a spacing of {self._spacing * 1e3:g} mm")
+        if declared is None:
+            sheet = lay_mesh(self._still, spacing=self._spacing, config=self._config.clouds)
+            cause = f"a mesh over the clouds at a spacing of {self._spacing * 1e3:g} mm"
+        else:
+            sheet, cause = Sheet(rest=declared.vertices, faces=declared.faces), MESH_CAUSE
+        refuse_many_particles(len(sheet.rest), cause)
         self._clouds = CloudTracker(sheet, self._declaration, self._still, self._config.clouds)
         return sheet
 

@@ -36,7 +36,8 @@ class PointTracker:
         """Track id of each particle, -1 where nothing is measured."""
         self.noise: CombinedNoise | None = None
         """Noise of the points, once there is a sheet."""
-        self._fields: Float[Array, "n modes"] | None = None
+        self.fields: Float[Array, "n modes"] | None = None
+        """The noise that neighbours share, as `Track.fields` has it, once there is a sheet."""
 
     def start(self, still: list[MeasuredPoints]) -> Sheet:
         """Return the mesh over the mean of one or more frames at rest; a declared mesh is returned unchanged.
@@ -81,8 +82,8 @@ class PointTracker:
         positions = np.array([_positions(frame, self.ids) for frame in frames])
         seen = np.asarray(np.isfinite(positions).all(axis=2).any(axis=0))
         self.noise = CombinedNoise.of(still[0], measure([positions], sheet.rest))
-        self._fields = self._shared(self.noise.noise, sheet.rest, seen)
-        counts = self.noise.measured or self._fields is not None
+        self.fields = self._shared(self.noise.noise, sheet.rest, seen)
+        counts = self.noise.measured or self.fields is not None
         self._least_sd = self.noise.noise.total_sd if counts else 0.0
         return sheet
 
@@ -94,11 +95,6 @@ class PointTracker:
         with_rest = fields * np.sqrt(1 + self._rest_variance / self._still_sd**2)[:, np.newaxis]
         return jnp.asarray(with_rest) if fields.shape[1] else None
 
-    @property
-    def fields(self) -> Float[Array, "n modes"] | None:
-        """Return the noise that neighbours share, as `Track.fields` has it; see `start`."""
-        return self._fields
-
     def track(self, points: MeasuredPoints) -> Track:
         """Return the particles of one frame, with the error of the rest positions in their covariance."""
         positions = _positions(_by_id(points), self.ids)
@@ -109,7 +105,7 @@ class PointTracker:
             positions=positions,
             covariance=variance[:, None, None] * np.eye(3),
             visible=visible,
-            fields=self._fields,
+            fields=self.fields,
         )
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jiggle_mj.estimate import Belief, Detection, Sheet
+from jiggle_mj.plausibility.problems import MAX_NOISE_RATIO
 
 from ..metrics.detection_metrics import dilate, patches
 from ..metrics.flat_map import Plane
@@ -13,8 +14,6 @@ from ..metrics.truth_transfer import TransferredTruth
 
 MAX_SD_RATIO = 1.5
 """Largest ratio of the found to the assumed standard deviation of a noise that is no doubt yet."""
-MAX_MEASURED_RATIO = 2.0
-"""Largest ratio of the measured to the stated standard deviation of points that is no doubt yet."""
 LISTED_PATCHES = 3
 """Patches whose place is given; the others are counted."""
 
@@ -80,7 +79,7 @@ def doubts(figures: Mapping[str, Any]) -> list[str]:
     points = noise.get("points") or {}
     if points.get("from") == "measured" and (stated := points["stated_sd_m"]) is not None:
         measured = float(np.hypot(points["point_sd_m"], points["smooth_sd_m"]))
-        if measured > MAX_MEASURED_RATIO * stated:
+        if measured > MAX_NOISE_RATIO * stated:
             sentences.append(
                 f"Frames at rest show a noise of {1e3 * measured:.2g} mm where the recording states "
                 f"{1e3 * stated:.2g} mm; the larger one counted."
