@@ -1,4 +1,4 @@
-"""Trackers of clouds whose points have no identities, over a mesh that is laid over the clouds of the sheet at rest.
+"""Trackers of clouds whose points have no identities, over the mesh of `cloud_mesh`.
 
 The filter 'implicit' matches each cloud to the state that it searches for (`cloud_surface`), so that state and
 attachments are estimated together. For the other filters a cloud becomes positions as in the paper: one step of the
@@ -20,83 +20,20 @@ from scipy.spatial import KDTree
 
 from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
-from jiggle_mj.mesh_checks import check_mesh
 from jiggle_mj.observation import Declaration, MeasuredPoints
-from jiggle_mj.sheet_triangulation import SheetPlane, triangulate
 
 from ..physics.environment import Grip
 from ..physics.mesh import SheetMesh
 from ..physics.simulator import simulator
 from ..physics.xpbd import XPBD
 from .chamfer import Chamfer
+from .cloud_mesh import evenly
 from .cloud_surface import Cloud, CloudSurface
 from .config import CloudTrackerConfig
 from .track import UNSEEN_VARIANCE, Track
 
 MIN_SHARE = 0.5
 """Smallest share of a cloud's points that lie on the sheet."""
-
-
-def lay_mesh(still: list[MeasuredPoints], *, spacing: float, config: CloudTrackerConfig | None = None) -> Sheet:
-    """Return a mesh over clouds of the sheet at rest.
-
-    Its particles are points of the largest cloud, thinned from the outline inwards, at the mean height of all clouds'
-    points around them.
-
-    Args:
-        still: clouds of the sheet at rest.
-        spacing: distance between neighbouring particles [m].
-        config: settings of the mesh; the defaults if None.
-
-    Raises:
-        PerceptionError: the sheet is too small for the spacing.
-        MeshError: the points show two sheets.
-    """
-    config = config or CloudTrackerConfig()
-    clouds = [points.positions[np.isfinite(points.positions).all(axis=1)] for points in still]
-    largest = max(clouds, key=len)
-    if len(largest) < config.min_points:
-        raise PerceptionError(
-            f"the clouds at rest have {len(largest)} points at most; a sheet needs {config.min_points}."
-        )
-    plane = SheetPlane.through(np.concatenate(clouds))
-    flat = plane.flatten(largest)
-    flat = np.concatenate([flat[on_outline := outline(flat, spacing)], flat[~on_outline]])
-    chosen = flat[thinned(flat, config.min_gap * spacing)]
-    if len(chosen) < config.min_points:
-        raise PerceptionError(
-            f"the clouds at rest give {len(chosen)} particles at a spacing of {spacing * 1e3:.1f} mm; a sheet needs "
-            f"{config.min_points} (record more points, or choose a smaller EstimatorConfig.spacing)."
-        )
-    faces = triangulate(chosen, config.max_edge * spacing)
-    used, faces = np.unique(faces, return_inverse=True)
-    points = np.concatenate(clouds)
-    around = KDTree(plane.flatten(points)).query_ball_point(chosen[used], config.neighbourhood * spacing)
-    above = (points - plane.centre) @ plane.axes[2]
-    height = np.array([above[near].mean() for near in around])
-    rest = plane.raise_up(chosen[used]) + height[:, None] * plane.axes[2]
-    check_mesh(rest, faces.reshape(-1, 3))
-    return Sheet(rest=rest, faces=faces.reshape(-1, 3))
-
-
-def outline(flat: Float[np.ndarray, "m 2"], spacing: float) -> Bool[np.ndarray, " m"]:
-    """Return which points lie on the outline of the sheet; gaps up to the spacing [m] are no outline."""
-    edges = np.sort(triangulate(flat, spacing)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    pairs, count = np.unique(edges, axis=0, return_counts=True)
-    on_outline = np.zeros(len(flat), bool)
-    on_outline[pairs[count == 1]] = True
-    return on_outline
-
-
-def thinned(flat: Float[np.ndarray, "m 2"], spacing: float) -> list[int]:
-    """Return the indices of points of which no two are nearer than the spacing [m], chosen in order."""
-    near = KDTree(flat).query_ball_point(flat, spacing)
-    free, chosen = np.ones(len(flat), bool), []
-    for i, around in enumerate(near):
-        if free[i]:
-            chosen.append(i)
-            free[around] = False
-    return chosen
 
 
 class CloudTracker:
@@ -166,9 +103,7 @@ class CloudTracker:
 
     def _finite(self, points: MeasuredPoints) -> Float[np.ndarray, "q 3"]:
         """Return the points that are there, at most `CloudTrackerConfig.samples` of them, evenly chosen [m]."""
-        cloud = points.positions[np.isfinite(points.positions).all(axis=1)]
-        few = min(len(cloud), self._config.samples)
-        return cloud[np.linspace(0, len(cloud), few, endpoint=False).astype(int)]
+        return evenly(points.positions[np.isfinite(points.positions).all(axis=1)], self._config.samples)
 
     def _padded(self, cloud: Float[np.ndarray, "q 3"]) -> Float[Array, "p 3"]:
         """Return a cloud as `CloudTrackerConfig.samples` rows, NaN behind its own, so that one program serves all."""

@@ -16,7 +16,8 @@ from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, Ster
 
 from ..physics.environment import Grip
 from ..ranges import refuse_many_particles
-from .cloud_tracker import CloudTracker, lay_mesh
+from .cloud_mesh import lay_mesh
+from .cloud_tracker import CloudTracker
 from .config import PerceptionConfig
 from .disparity import Disparity
 from .point_noise import CombinedNoise

@@ -71,8 +71,8 @@ def _use(survey: Survey) -> Iterator[RecordingProblem]:
     if survey.sensing == "cloud":
         yield _warn(
             "no-identities",
-            "points are not the same from frame to frame, as they have no track_id: attachments are found much less "
-            "well, and their intervals are too narrow.",
+            "points are not the same from frame to frame, as they have no track_id: only the shape of the surface "
+            "shows, not what slides along it.",
         )
     if survey.missing_tracks:
         named = ", ".join(map(str, survey.missing_tracks[:5]))

@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.estimator.perception.chamfer import Chamfer, nearest
-from jiggle_mj.estimator.perception.cloud_tracker import CloudTracker, lay_mesh, offset, thinned
-from jiggle_mj.estimator.perception.config import CloudTrackerConfig
+from jiggle_mj.estimator.perception.cloud_tracker import CloudTracker, offset
 from jiggle_mj.estimator.physics.environment import Grip
-from jiggle_mj.estimator.physics.mesh import SheetMesh
 from jiggle_mj.observation import MeasuredPoints
 from tests.support.small_sheet import DECLARATION, GRIP_RADIUS, SPACING, attached, cloud, corners, lifts, sheet
 
@@ -128,34 +125,6 @@ def test_without_reach_the_hidden_part_is_pulled_to_the_seen_one():
     built = [Chamfer.build(sheet(), count=400, reach=reach) for reach in (np.inf, SPACING)]
     pull = [np.abs(jax.grad(chamfer.distance)(x, half)) for chamfer in built]
     assert (pull[0][hidden, 0] > 1e-3).all() and (pull[1][hidden] == 0).all()
-
-
-def test_a_mesh_over_clouds_at_rest():
-    """Neighbours are 0.75 to 1 spacings apart, heights a quarter of a point's noise off, the outline 7 % inside."""
-    still = [measured(sheet().rest, seed) for seed in range(3)]
-    laid = lay_mesh(still, spacing=SPACING)
-    gaps = cdist(laid.rest, laid.rest) + np.eye(len(laid.rest))
-    nearest_gap = gaps.min(axis=1).mean() / SPACING
-    assert CloudTrackerConfig.min_gap < nearest_gap < 1
-    assert np.abs(laid.rest[:, 2]).max() < 0.5 * SD
-    assert 0.9 < SheetMesh(laid.rest, laid.faces).face_area.sum() / sheet().face_area.sum() < 1
-
-
-def test_thinning_keeps_points_apart_and_leaves_no_hole():
-    flat = np.random.default_rng(0).uniform(0, 1, (2000, 2))
-    chosen = flat[thinned(flat, 0.1)]
-    gaps = cdist(chosen, chosen) + np.eye(len(chosen))
-    assert gaps.min() > 0.1 and cdist(flat, chosen).min(axis=1).max() <= 0.1
-
-
-def test_too_few_points_are_refused():
-    with pytest.raises(PerceptionError, match=r"a sheet needs 20 \(record more points, or choose a smaller"):
-        lay_mesh([measured(sheet().rest, 0)], spacing=0.05)
-    nothing = MeasuredPoints(positions=np.full((100, 3), np.nan), sd=SD)
-    with pytest.raises(PerceptionError, match="have 0 points at most; a sheet needs 20"):
-        lay_mesh([nothing], spacing=SPACING)
-    rest = [nothing, measured(sheet().rest, 0)]
-    np.testing.assert_array_equal(lay_mesh(rest, spacing=SPACING).rest, lay_mesh(rest[1:], spacing=SPACING).rest)
 
 
 def test_a_cloud_without_points_shows_no_particle():
