@@ -75,7 +75,7 @@ class EstimatorConfig:
     refinement: Refinement = "grasps"
     """When the filter 'implicit' learns the noise and refines the belief thoroughly: 'grasps', whenever the jaws open;
     'end', at the end alone; 'frames', for a policy that waits for the belief: thoroughly at the end alone, and by a few
-    samples after each frame, which takes a second or two instead of a sweep's milliseconds."""
+    samples after each frame, which takes a tenth of a second or two instead of a sweep's milliseconds."""
     detect_above: float = 0.011
     """Mean stiffness above which filters without P(attached) report a particle as attached [k]."""
     perception: PerceptionConfig = field(default_factory=PerceptionConfig)

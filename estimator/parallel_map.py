@@ -20,12 +20,13 @@ whole core is free."""
 def parallel_map(function: Callable[[int], T], keys: Iterable[int]) -> dict[int, T]:
     """Return the value of the function for each key, in the order of the keys.
 
-    Every thread uses the caller's setting of `jax_enable_x64`. An exception of any call is raised here.
+    Every thread uses the caller's `jax_enable_x64` and `jax_default_device`. An exception of any call is raised here.
     """
-    keys, x64 = list(keys), jax.config.read("jax_enable_x64")
+    keys = list(keys)
+    x64, device = jax.config.read("jax_enable_x64"), jax.config.jax_default_device
 
     def call(key: int) -> T:
-        with jax.enable_x64(x64):  # a setting of each thread
+        with jax.enable_x64(x64), jax.default_device(device):  # settings of each thread
             return function(key)
 
     with ThreadPoolExecutor(THREADS_PER_CORE * usable_cores()) as pool:

@@ -9,7 +9,7 @@ The posterior is found in two ways:
   propagation passes log odds between neighbours. Each sweep also updates the component weights of the prior
   (`SpikeAndSlab.learned`). Sites, messages and weights are kept from frame to frame, so a few sweeps a frame suffice.
 - Gibbs sampling (`attachment_sampler`). Expectation propagation may fail where several particles can bear one load;
-  samples find the likely ones, in seconds instead of milliseconds.
+  samples find the likely ones, in ten times the time or more.
 
 All arrays are float64: a float32 covariance of 600 stiffnesses loses definiteness.
 """
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .attachment_prior import AttachmentPrior
-from .attachment_sampler import PosteriorSamples, Sampler
+from .attachment_sampler import Chain, PosteriorSamples, Sampler
 from .config import BeliefConfig
 from .expectation_propagation import (
     MIN_SITE_PRECISION,
@@ -57,6 +57,10 @@ class AttachmentBelief(eqx.Module):
     """Precision times mean of each particle's site."""
     message: Float[Array, "n d"]
     """Log odds of being attached that each neighbour adds."""
+    chain_component: Int[Array, "chains n"]
+    """Component of each particle in each chain of the sampler, as sampled last; 0 before."""
+    chain_weights: Float[Array, "chains _components"]
+    """Component weights of each chain; 0 before any samples."""
     config: BeliefConfig = eqx.field(static=True, default_factory=BeliefConfig)
     """Settings of the sweeps, the samples and the intervals."""
 
@@ -65,7 +69,8 @@ class AttachmentBelief(eqx.Module):
         cls, prior: AttachmentPrior, *, reference: float, config: BeliefConfig | None = None
     ) -> "AttachmentBelief":
         """Return the belief before any evidence; `reference` is b_ref [N/m]."""
-        n = len(prior.neighbours)
+        n, config = len(prior.neighbours), config or BeliefConfig()
+        chains = config.sampler.chains
         empty = cls(
             prior=prior,
             reference=jnp.asarray(reference, dtype=float),
@@ -74,7 +79,9 @@ class AttachmentBelief(eqx.Module):
             site_precision=jnp.zeros(n),
             site_shift=jnp.zeros(n),
             message=jnp.zeros(prior.neighbours.shape),
-            config=config or BeliefConfig(),
+            chain_component=jnp.zeros((chains, n), int),
+            chain_weights=jnp.zeros((chains, len(prior.stiffness.weights))),
+            config=config,
         )
         return empty._settled_without_evidence()
 
@@ -167,42 +174,45 @@ class AttachmentBelief(eqx.Module):
         )
 
     def sampled(
-        self,
-        key: PRNGKeyArray,
-        *,
-        burn_in: int,
-        rounds: int | Int[Array, ""],
-        doublings: int | Int[Array, ""] = 1,
-    ) -> tuple["AttachmentBelief", Bool[Array, ""]]:
-        """Return the belief that matches samples of the posterior, and whether both halves of the samples agree.
+        self, key: PRNGKeyArray, *, burn_in: int, first_burn_in: int, sweeps: int, doublings: int = 1
+    ) -> tuple["AttachmentBelief", bool]:
+        """Return the belief that matches samples of the posterior, and whether the samples agree.
 
-        The chain begins at the likeliest component of each particle. Sites match the sampled mean and, as nearly as
-        their range allows, the sampled variance of s; messages match the sampled P(attached). See `Sampler.run` for
-        the arguments.
+        The chains continue where they ended last, or begin at the likeliest component of each particle. Sites match
+        the sampled mean and, as nearly as their range allows, the sampled variance of s; messages match the sampled
+        P(attached). Not for use in compiled functions.
+
+        Args:
+            key: see `Sampler.run`.
+            burn_in: sweeps of each chain that do not count, where it continues.
+            first_burn_in: the same where it begins.
+            sweeps: see `Sampler.run`.
+            doublings: see there.
         """
-        sampler, component = self._sampler()
-        samples = sampler.run(component, key, burn_in=burn_in, rounds=rounds, doublings=doublings)
-        return self._match_samples(samples), samples.agree
+        sampler, chains, drawn = _chains(self)
+        burn_in = burn_in if drawn else first_burn_in
+        chains, agree = sampler.run(chains, key, burn_in=burn_in, sweeps=sweeps, doublings=doublings)
+        return _matching(self, chains), agree
 
     def mode(self, key: PRNGKeyArray) -> Float[Array, " n"]:
         """Return s at a local mode of the joint posterior, near the likeliest component of each particle.
 
         See `Sampler.mode`; s is 0 where a particle is free.
         """
-        sampler, begin = self._sampler()
-        component, mean = sampler.mode(begin, key)
+        component, mean = self._sampler().mode(self._likeliest(), key)
         return jnp.where(component > 0, jnp.clip(mean, 0, MAX_MEAN), 0.0)
 
-    def _sampler(self) -> tuple[Sampler, Int[Array, " n"]]:
-        """Return the sampler of the posterior, and the likeliest component of each particle by itself."""
+    def _sampler(self) -> Sampler:
+        return Sampler.build(self.prior, self.precision, self.shift, self.config.sampler)
+
+    def _likeliest(self) -> Int[Array, " n"]:
+        """Return the likeliest component of each particle by itself."""
         mixture = self.mixture()
-        component = jnp.where(mixture.attached > 0.5, 1 + jnp.argmax(mixture.weight[1:], axis=0), 0)
-        sampler = Sampler(prior=self.prior, precision=self.precision, shift=self.shift, config=self.config.sampler)
-        return sampler, component
+        return jnp.where(mixture.attached > 0.5, 1 + jnp.argmax(mixture.weight[1:], axis=0), 0)
 
     def _match_samples(self, samples: PosteriorSamples) -> "AttachmentBelief":
         """Return the belief whose sites and messages give the sampled moments and probabilities."""
-        sites = sites_with_variance(self.precision, samples.variance, damping=self.config.damping)
+        sites = sites_with_variance(self.precision, samples.variance)
         shift = self.precision @ samples.mean + sites * samples.mean - self.shift
         belief = eqx.tree_at(
             lambda belief: (belief.site_precision, belief.site_shift, belief.prior.stiffness.weights),
@@ -336,3 +346,22 @@ class AttachmentBelief(eqx.Module):
                 self.prior.stiffness.learned(mixture, log_bayes_factor, rate=self.config.learning_rate),
             ),
         )
+
+
+@eqx.filter_jit
+def _chains(belief: AttachmentBelief) -> tuple[Sampler, list[Chain], Bool[Array, ""]]:
+    """Return the sampler of a belief, its chains to run, and whether these were sampled before."""
+    sampler, drawn, chains = belief._sampler(), jnp.any(belief.chain_weights > 0), belief.chain_component
+    component = jax.lax.cond(drawn, lambda: chains, lambda: jnp.broadcast_to(belief._likeliest(), chains.shape))
+    weights = jnp.where(drawn, belief.chain_weights, belief.prior.stiffness.weights[None])
+    return sampler, [sampler.start(*start) for start in zip(component, weights, strict=True)], drawn
+
+
+@eqx.filter_jit
+def _matching(belief: AttachmentBelief, chains: list[Chain]) -> AttachmentBelief:
+    """Return the belief that matches the samples of chains, and keeps where they are."""
+    return eqx.tree_at(
+        lambda belief: (belief.chain_component, belief.chain_weights),
+        belief._match_samples(PosteriorSamples.of(chains)),
+        (jnp.stack([chain.component for chain in chains]), jnp.stack([chain.weights for chain in chains])),
+    )

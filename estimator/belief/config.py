@@ -14,22 +14,20 @@ from ..ranges import check_parts, check_ranges
 class SamplerConfig:
     """Settings of the Gibbs sampler."""
 
-    candidates: int = 16
+    chains: int = 8
+    """Chains that run side by side. More of them start from more places and use more cores; fewer forget where they
+    started in fewer sweeps altogether."""
+    candidates: int = 32
     """Particles whose next component is drawn together. More of them save sequential steps where few particles change,
     and cost more for each change. Affects the speed alone."""
-    pending_updates: int = 32
-    """Rank-one updates of the covariance that are applied as one product: each by itself would read and write all of
-    it. Affects the speed alone."""
-    sweeps_per_round: int = 10
-    """Sweeps between two factorisations of the precision, which remove the rounding errors of the rank-one updates."""
     agreement: float = 0.02
-    """Mean difference of P(attached) between the two halves of the sweeps below which they agree. Small against
+    """Mean difference of P(attached) between the two halves of the chains below which they agree. Small against
     the 0.5 above which a particle is called attached."""
 
     def __post_init__(self) -> None:
         """Check types and ranges."""
-        for name in ("candidates", "pending_updates", "sweeps_per_round"):
-            as_integer(getattr(self, name), f"SamplerConfig.{name}", at_least=1)
+        as_integer(self.chains, "SamplerConfig.chains", at_least=2)
+        as_integer(self.candidates, "SamplerConfig.candidates", at_least=1)
         check_ranges(self, positive=("agreement",))
 
 

@@ -20,8 +20,10 @@ MIN_SITE_PRECISION, MAX_SITE_PRECISION = 1e-2, 1e14
 of the evidence. Only a negative site precision could express that, and the total precision might lose definiteness."""
 MIN_SAMPLED_PROBABILITY = 1e-9
 """Smallest distance of a sampled probability from 0 and 1, so that its log odds stay finite."""
-VARIANCE_MATCHING_STEPS = 10
-"""Damped fixed-point steps towards the site precisions that give the sampled variances."""
+MAX_VARIANCE_STEPS = 10
+"""Most fixed-point steps towards the site precisions that give the sampled variances."""
+SITE_CHANGE = 0.05
+"""Relative change of every site's precision below which they end: samples err by 0.1. Three or four steps are usual."""
 
 
 def cavity(
@@ -63,17 +65,20 @@ def passed_messages(
     return sent[prior.neighbours, prior.back]
 
 
-def sites_with_variance(
-    evidence_precision: Float[Array, "n n"], variance: Float[Array, " n"], *, damping: float
-) -> Float[Array, " n"]:
+def sites_with_variance(evidence_precision: Float[Array, "n n"], variance: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return the site precisions that give each s a variance, as nearly as their range allows."""
 
-    def step(_, sites):
+    def step(state):
+        sites, _, count = state
         found = GaussianInformation(evidence_precision + jnp.diag(sites), jnp.zeros_like(sites)).variances()
-        return jnp.clip(sites + damping * (1 / variance - 1 / found), MIN_SITE_PRECISION, MAX_SITE_PRECISION)
+        after = jnp.clip(sites + 1 / variance - 1 / found, MIN_SITE_PRECISION, MAX_SITE_PRECISION)
+        return after, jnp.any(jnp.abs(after - sites) > SITE_CHANGE * sites), count + 1
+
+    def changing(state):
+        return state[1] & (state[2] < MAX_VARIANCE_STEPS)
 
     first = jnp.clip(1 / variance, MIN_SITE_PRECISION, MAX_SITE_PRECISION)
-    return jax.lax.fori_loop(0, VARIANCE_MATCHING_STEPS, step, first)
+    return jax.lax.while_loop(changing, step, (first, jnp.asarray(True), jnp.asarray(0)))[0]
 
 
 def messages_with_probability(

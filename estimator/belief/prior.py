@@ -45,6 +45,12 @@ class PriorConfig:
                 raise ValueError(f"PriorConfig.{name} must lie between 0 and 1; got {getattr(self, name)}.")
         if not self.components or not all(0 < s <= 1 for s in self.components):
             raise ValueError(f"PriorConfig.components must be one or more s in (0, 1]; got {self.components}.")
+        softest = self.spread * min(self.components)
+        if self.spike >= softest:
+            raise ValueError(
+                f"PriorConfig.spike must be below {softest:g}, the standard deviation of the softest component (spread "
+                f"times its s), or a free particle is as stiff as an attached one; got {self.spike}."
+            )
 
 
 def stiffness_prior(config: PriorConfig) -> SpikeAndSlab:

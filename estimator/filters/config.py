@@ -42,18 +42,18 @@ class FilterConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingConfig:
-    """Numbers of samples; `Sampler.run` explains rounds and doublings."""
+    """Numbers of samples, in sweeps of every chain; `Sampler.run` explains sweeps and doublings."""
 
-    burn_in: int = 3
-    """Rounds that are drawn first and not averaged."""
-    quick_rounds: int = 3
-    """Rounds of samples between grasps and between frames."""
-    quick_doublings: int = 1
-    """Most doublings of those rounds."""
-    thorough_rounds: int = 20
-    """Rounds of samples at the end of a thorough refinement."""
+    burn_in: int = 2
+    """Sweeps that are drawn first and not averaged, where chains continue from the frame before."""
+    first_burn_in: int = 10
+    """The same where they begin."""
+    quick_sweeps: int = 6
+    """Sweeps between grasps and between frames."""
+    thorough_sweeps: int = 25
+    """Sweeps at the end of a thorough refinement."""
     thorough_doublings: int = 3
-    """Most doublings of those rounds."""
+    """Most doublings of those sweeps."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -61,10 +61,10 @@ class SamplingConfig:
 
     @property
     def quick(self) -> tuple[int, int]:
-        """Rounds and doublings of samples between grasps and between frames."""
-        return self.quick_rounds, self.quick_doublings
+        """Sweeps and doublings of samples between grasps and between frames."""
+        return self.quick_sweeps, 0
 
     @property
     def thorough(self) -> tuple[int, int]:
-        """Rounds and doublings of samples at the end of a thorough refinement."""
-        return self.thorough_rounds, self.thorough_doublings
+        """Sweeps and doublings of samples at the end of a thorough refinement."""
+        return self.thorough_sweeps, self.thorough_doublings

@@ -238,7 +238,7 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
 
 
 def sampled(
-    belief: AttachmentBelief, key: PRNGKeyArray, rounds: tuple[int, int], config: SamplingConfig
+    belief: AttachmentBelief, key: PRNGKeyArray, sweeps: tuple[int, int], config: SamplingConfig
 ) -> PosteriorSummary:
     """Return the posterior by samples.
 
@@ -247,11 +247,15 @@ def sampled(
     Args:
         belief: what to draw from.
         key: of the draws.
-        rounds: rounds of samples, and how often they may be doubled.
+        sweeps: sweeps of each chain, and how often they may be doubled.
         config: how many are drawn first and not averaged.
     """
+    first, doublings = sweeps
     with jax.default_device(_cpus()[0]):
-        return _sampled(belief, key, *map(jnp.asarray, rounds), burn_in=config.burn_in)
+        after_samples, agree = belief.sampled(
+            key, burn_in=config.burn_in, first_burn_in=config.first_burn_in, sweeps=first, doublings=doublings
+        )
+        return _summarised(after_samples, Convergence.SAMPLES_DISAGREE.unless(jnp.asarray(agree)))
 
 
 def quick_summary(belief: AttachmentBelief, *, seed: int = 0, config: SamplingConfig | None = None) -> PosteriorSummary:
@@ -291,19 +295,6 @@ def _swept(belief: AttachmentBelief, sweeps: int) -> PosteriorSummary:
     return _summary(belief.swept(sweeps), Convergence.CONVERGED.code)
 
 
-@eqx.filter_jit
-def _sampled(
-    belief: AttachmentBelief,
-    key: PRNGKeyArray,
-    rounds: Int[Array, ""],
-    doublings: Int[Array, ""],
-    *,
-    burn_in: int,
-) -> PosteriorSummary:
-    after_samples, agree = belief.sampled(key, burn_in=burn_in, rounds=rounds, doublings=doublings)
-    return _summary(after_samples, Convergence.SAMPLES_DISAGREE.unless(agree))
-
-
 def _cpus() -> list[Any]:
     try:
         return jax.devices("cpu")
@@ -322,6 +313,9 @@ def _summary(belief: AttachmentBelief, convergence: Int[Array, ""]) -> Posterior
         probability=posterior.attached,
         entropy=posterior.entropy,
     )
+
+
+_summarised = eqx.filter_jit(_summary)
 
 
 def _normalised_innovation(information: FrameInformation, gaussian: Gaussian, evidence: Evidence) -> Float[Array, ""]:

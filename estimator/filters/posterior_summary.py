@@ -20,7 +20,7 @@ class Convergence(IntEnum):
     SEARCH_CUT_OFF = 1
     """The search for a frame's state reached its largest number of steps."""
     SAMPLES_DISAGREE = 2
-    """The two halves of the samples give different P(attached)."""
+    """The two halves of the chains of samples give different P(attached)."""
 
     def unless(self, converged: Bool[Array, ""]) -> Int[Array, ""]:
         """Return the code CONVERGED where that is true, else this one's."""

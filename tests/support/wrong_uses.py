@@ -174,7 +174,7 @@ def engines(folder: Path) -> Iterator[Use]:
         (PerceptionConfig, {"stereo": ({}, 3)}),
         (StereoTrackerConfig, {"min_depth": ABOVE_ZERO, "min_found": (-1, 2, "most"), "mesh": (None,)}),
         (BeliefConfig, {"damping": (0, 1.5, "much"), "tail": (0.5, None), "sampler": ({},)}),
-        (SamplerConfig, {"candidates": (0, 1.5, "16"), "agreement": (0, "0.1")}),
+        (SamplerConfig, {"chains": (1, 2.5), "candidates": (0, 1.5, "16"), "agreement": (0, "0.1")}),
     ):
         yield from changed(config.__name__, config, {}, wrong)
     for given in (None, "run.mcap", [observation()], POINTS, SimpleNamespace(index=0, tool=None)):

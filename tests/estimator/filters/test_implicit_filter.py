@@ -62,12 +62,13 @@ def test_the_attached_particles_are_found_and_no_others(stiffness):
     """Four corner lifts with 0.1 mm of noise show the rim; particles inside a stiff patch have no load and cannot show.
 
     Beside a weld hardly anything moves: single neighbours may seem attached, and some of its rim may seem free. So the
-    bar is 0.5 of a weld's rim, and 0.9 of a soft one's: 14 of 24 show, and one or two more or less are chance.
+    bar is 0.5 of a weld's rim, and 0.9 of a soft one's: 14 of 24 show, and one or two more or less are chance. So is
+    the mean of P(attached) there: 0.60 by long chains, 0.58 over six seeds, from 0.50 to 0.74.
     """
     probability, around = np.array([summary.probability for _, summary in runs(stiffness)]), rim()
     found = probability > 0.5
     assert found[:, around].mean() >= (0.9 if stiffness <= STIFFNESS else 0.5)
-    assert probability[:, around].mean() > 0.6
+    assert probability[:, around].mean() > (0.6 if stiffness <= STIFFNESS else 0.5)
     assert not (found & ~dilate(attached(), sheet().faces, 1)).any()
     if stiffness <= STIFFNESS:
         assert ((found != attached()).sum(axis=1) <= 1).all()

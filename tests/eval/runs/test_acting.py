@@ -76,7 +76,8 @@ def test_ours_looks_grasps_and_pulls_in_steps_and_learns(ours):
     assert all(one.why and one.plan_s > 0 for one in policy.decisions)
     words = [one.does for one in policy.decisions]
     assert words[0].startswith("grasp at (") and words[1].startswith("move to (") and words[1].endswith(") mm")
-    assert loop.entropy[-1] < loop.entropy[0] < loop.estimator.prior_entropy
+    closed, moved = loop.entropy[:2]  # where the jaws close nothing has moved, and hardly anything is learned
+    assert loop.entropy[-1] < moved < min(closed, loop.estimator.prior_entropy)
 
 
 @pytest.mark.slow
@@ -160,8 +161,12 @@ def test_another_place_is_worth_going_to_if_it_teaches_more_than_it_costs_to_get
     config = InformationPolicyConfig(regrasp_steps=cost, min_gain=0.0)
     action, why = OnePull(Limits(), radius=8e-3, seed=0, config=config).plan(loop.estimator)
     assert (why == "another place teaches more") is goes
-    assert isinstance(action, Move)
-    np.testing.assert_array_equal(action.to, loop.estimator.hold.tip if goes else here)
+    back = np.linalg.norm(loop.estimator.tool.position - loop.estimator.hold.tip) < 0.1 * STEP
+    if goes and back:
+        assert isinstance(action, Release)
+    else:
+        assert isinstance(action, Move)
+        np.testing.assert_array_equal(action.to, loop.estimator.hold.tip if goes else here)
 
 
 def test_where_every_attachment_is_decided_enough_is_known(ours, monkeypatch):
