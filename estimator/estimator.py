@@ -6,7 +6,7 @@ camera's calibration and the declaration.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +17,8 @@ from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.argument_checks import as_array, as_instance
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import ObservationError, PerceptionError
-from jiggle_mj.estimate import Belief, Detection, Estimate, PointNoise, Sheet
-from jiggle_mj.material import Material, material
+from jiggle_mj.estimate import Belief, Detection, Estimate, KeptFrames, PointNoise, Sheet
+from jiggle_mj.material import Material, check_ratios
 from jiggle_mj.observation import Declaration, Observation, ToolState
 
 from . import summaries
@@ -26,12 +26,12 @@ from .belief.attachment_belief import AttachmentBelief
 from .belief.topology import Change, region_of
 from .blas import one_thread
 from .config import EstimatorConfig
-from .filters.filter import FilterState
 from .filters.force_balance import ForceBalance
-from .filters.posterior_summary import Convergence, PosteriorSummary
+from .filters.kept_frames import kept_frames
+from .filters.posterior_summary import Convergence
 from .fusion import fill_unseen, fuse, pull
 from .grip import GripHold, GripTracker
-from .identification import identify
+from .identifying import OnPass, identify_tracked
 from .perception import Disparity, FrameMask, Perception, SimulatorInput, TissueMask, Track
 from .perception.cloud_tracker import matched
 from .physics.environment import Grip
@@ -135,8 +135,7 @@ class Estimator:
         self._seen_precision = track.white_precision[track.visible].mean(axis=0)
         if self.config.refinement == "frames":
             tracked.state = tracked.filter.resample(tracked.state)
-        summary = tracked.state.summary
-        b = np.asarray(summary.b)
+        summary, b = tracked.state.summary, np.asarray(tracked.state.summary.b)
         return Estimate(
             index=observation.index,
             time=observation.time,
@@ -180,21 +179,22 @@ class Estimator:
         """
         self._release(at_the_end=True)
 
-    def identify(self, *, on_pass: Callable[[dict[str, float]], None] = lambda _: None) -> Material:
+    def identify(self, parameters: Sequence[str] = (), *, on_pass: OnPass = lambda _: None) -> Material:
         """Return the sheet's own parameters from all frames so far; the belief becomes the one that goes with them.
 
         Args:
+            parameters: some of 'weight' and 'bending'; the other stays as declared. Both if none is named.
             on_pass: called with each ratio's factor after each pass, for progress.
 
         Raises:
             ValueError: asked before `begin` and the first frame with closed jaws, or of another filter than 'implicit'.
+            OptionError: the sheet has no such parameter.
         """
-        filter = self._tracked.filter.by_forces("can identify the sheet")
+        self._tracked.filter.by_forces("can identify the sheet")
+        check_ratios(parameters)
         self.release()
         with jax.enable_x64(True), one_thread():
-            found = identify(filter, self._tracked.state, on_pass=on_pass)
-            self._take(found.state, found.summary)
-        return material(self.declaration, found.factors, found.log_sd, converged=found.converged)
+            return identify_tracked(self._tracked, self.declaration, parameters, on_pass=on_pass)
 
     @property
     def belief(self) -> Belief:
@@ -221,6 +221,11 @@ class Estimator:
             noise=tracked.filter.noise(tracked.state),
             refined=Convergence(int(tracked.state.release_convergence)),
         )
+
+    @property
+    def kept_frames(self) -> KeptFrames | None:
+        """What `identify_kept` needs of the frames so far; None where it cannot be kept (`filters.kept_frames`)."""
+        return kept_frames(self._tracked.state)
 
     @property
     def prior_entropy(self) -> float:
@@ -362,16 +367,8 @@ class Estimator:
             return
         thorough = at_the_end or self.config.refinement == "grasps"
         with jax.enable_x64(True), one_thread():
-            self._take(*tracked.filter.release(tracked.state, thorough=thorough))
-
-    def _take(self, state: FilterState, summary: PosteriorSummary | None) -> None:
-        """Take the state after a refinement, and refuse a posterior that is not finite."""
-        self._tracked.state = state
-        if summary is not None and not summary.is_finite:
-            raise PerceptionError(
-                "refined together, the frames of all grasps leave no finite belief: no attachments explain them "
-                "together. The belief stays as it was; leave out grasps to find the one that does not fit."
-            )
+            tracked.state, summary = tracked.filter.release(tracked.state, thorough=thorough)
+            summaries.refuse_not_finite(summary)
 
     def _see(self, observation: Observation) -> Track:
         simulated = None if self._tracked.filter.matches_clouds else lambda: self._prediction(observation.tool)

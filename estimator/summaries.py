@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jiggle_mj.errors import PerceptionError
 from jiggle_mj.estimate import Belief, Detection
 from jiggle_mj.observation import Declaration
 
@@ -27,6 +28,19 @@ def belief(summary: PosteriorSummary) -> Belief:
         lower=np.asarray(lower),
         upper=np.asarray(upper),
     )
+
+
+def refuse_not_finite(summary: PosteriorSummary | None) -> None:
+    """Refuse the posterior of a refinement that is not finite; None stands for none.
+
+    Raises:
+        PerceptionError: it is not.
+    """
+    if summary is not None and not summary.is_finite:
+        raise PerceptionError(
+            "refined together, the frames of all grasps leave no finite belief: no attachments explain them "
+            "together. The belief stays as it was; leave out grasps to find the one that does not fit."
+        )
 
 
 def detection(

@@ -262,7 +262,7 @@ def estimate(
                 "the tool holds the tissue."
             )
         if writer is not None:
-            writer.finish(estimator.belief, estimator.detection, skipped=skipped)
+            writer.finish(estimator.belief, estimator.detection, skipped=skipped, frames=estimator.kept_frames)
     return Episode(
         sheet=estimator.sheet,
         estimates=tuple(estimates),

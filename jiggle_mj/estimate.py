@@ -76,6 +76,32 @@ class Estimate:
 
 
 @dataclass(frozen=True, kw_only=True)
+class KeptFrames:
+    """What the filter keeps of its frames, so that they can be linearised again without the recording."""
+
+    grasp: Int[np.ndarray, " f"]
+    """Number of each frame's grasp, from 0 and rising."""
+    x: Float[np.ndarray, "f n 3"]
+    """Positions that were found [m]."""
+    y: Float[np.ndarray, "f n 3"]
+    """Positions by perception and grip together [m]; anything finite where there is no observation."""
+    precision: Float[np.ndarray, "f n 3 3"]
+    """Inverse covariance of each position, with all its noise [1/m^2]; zero where a particle is missing."""
+    held: Bool[np.ndarray, "f n"]
+    """Particles in the grip."""
+    force_unknown: Bool[np.ndarray, "f n"]
+    """Particles that the grip may pull at, the held ones included."""
+    fields: Float[np.ndarray, "n m"] | None = None
+    """The noise that neighbours share as fields, the same in all frames [m]; None where no noise is shared."""
+
+    @property
+    def nbytes(self) -> int:
+        """Return the memory of the arrays [byte]."""
+        arrays = (self.grasp, self.x, self.y, self.precision, self.held, self.force_unknown, self.fields)
+        return sum(0 if array is None else array.nbytes for array in arrays)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Belief:
     """Gaussian over all attachments: over their stiffness b [N/m], or over the bounded s = b / (b + reference)."""
 

@@ -138,6 +138,10 @@ class ForceBalanceFilter(Filter[State]):
         """Return the latest belief over the attachments."""
 
     @abstractmethod
+    def shared_noise(self, state: State) -> Noise:
+        """Return further factors on the variances, for what the frames of all grasps estimate together."""
+
+    @abstractmethod
     def frames(self, state: State) -> Iterator[tuple[Evidence, Float[Array, "n 3"]]]:
         """Yield the evidence, with the learned noise, and the positions [m] of every frame since the last change."""
 

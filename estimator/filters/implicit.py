@@ -179,6 +179,11 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
         """See `ForceBalanceFilter.belief`."""
         return state.belief
 
+    def shared_noise(self, state: ImplicitState) -> Noise:
+        """See `ForceBalanceFilter.shared_noise`."""
+        residuals = [grasp.residuals for grasp in state.grasps if grasp.residuals is not None]
+        return Noise.shared(residuals) if residuals and self.learns_noise else Noise()
+
     def frames(self, state: ImplicitState) -> Iterator[tuple[Evidence, Float[Array, "n 3"]]]:
         """See `ForceBalanceFilter.frames`."""
         for grasp in state.grasps:
@@ -189,6 +194,11 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
         """See `ForceBalanceFilter.refit`."""
         grasps = tuple(replace(grasp, noise=None) for grasp in state.grasps)
         return self._refined(replace(state, balance=state.balance.with_energy(energy), noise=Noise(), grasps=grasps))
+
+    def linearised(self, state: ImplicitState, b: Float[Array, " n"]) -> ImplicitState:
+        """Return the state with all grasps linearised at stiffnesses b [N/m], and the belief by a few samples."""
+        state, summary = self._relinearised(state, replace(state.summary, b=b), self.config.relinearise_beyond, 1)
+        return replace(state, summary=summary)
 
     def _refined(self, state: ImplicitState) -> tuple[ImplicitState, PosteriorSummary]:
         """Linearise stale grasps again, learn the noise from their residuals, repeat; then draw many samples."""

@@ -16,6 +16,7 @@ of both noises, and data hold little evidence about a noise that is smaller than
 """
 
 from collections.abc import Sequence
+from functools import reduce
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -65,6 +66,22 @@ class Noise(eqx.Module):
         learned = Noise(force=max(1.0, self.force * force), position=max(1.0, self.position * position))
         change = max(_ratio(learned.force, self.force), _ratio(learned.position, self.position))
         return learned if change > MIN_CHANGE else self
+
+    @classmethod
+    def shared(cls, grasps: Sequence[ForceResiduals]) -> "Noise":
+        """Return the further factors for what all grasps estimate together, such as a parameter of the sheet.
+
+        An error that is the same in every grasp, as that of the rest shape is, adds up over all of them. So it counts
+        by the sum over all frames, where this asks for more than the sums over each grasp.
+
+        Args:
+            grasps: residuals of each grasp, at least one, whitened by the noise as learned.
+        """
+        total = reduce(ForceResiduals.__add__, grasps)
+        return cls(
+            force=max(1.0, _excess([(total.force, total.force_degrees)])),
+            position=max(1.0, _excess([(total.position, total.position_degrees)])),
+        )
 
 
 def _excess(grasps: list[tuple[Float[Array, "n 3"], Float[Array, ""]]]) -> float:

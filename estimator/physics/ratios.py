@@ -4,9 +4,14 @@ Scaling every stiffness and every force by one factor moves nothing. So the memb
 other parameter is a factor on its declared value.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jiggle_mj.errors import OptionError
+from jiggle_mj.material import RATIOS, check_ratios
 
 from .bending import IsometricBending
 from .energy import SheetEnergy, Term
@@ -15,15 +20,36 @@ from .environment import BedContact, Weight
 
 def ratios(energy: SheetEnergy) -> tuple[str, ...]:
     """Return the names of the ratios that the sheet has; without gravity it has no weight."""
-    return ("weight", "bending") if any(isinstance(term, Weight) for term in energy.terms) else ("bending",)
+    has_weight = any(isinstance(term, Weight) for term in energy.terms)
+    return tuple(name for name in RATIOS if has_weight or name != "weight")
 
 
-def scaled(energy: SheetEnergy, log_factor: Float[Array, " k"]) -> SheetEnergy:
-    """Return the energy with each of its `ratios` multiplied by a factor, given by its logarithm; differentiable.
+def chosen(energy: SheetEnergy, names: Sequence[str]) -> tuple[str, ...]:
+    """Return those of the sheet's ratios that are named, in the order of `ratios`; all of them where none is named.
+
+    Raises:
+        OptionError: the sheet has no ratio of a name.
+    """
+    check_ratios(names)
+    known = ratios(energy)
+    if absent := set(names) - set(known):
+        raise OptionError(f"parameter '{min(absent)}': without gravity the sheet has none; leave it out.")
+    return tuple(name for name in known if name in names) if names else known
+
+
+def scaled(energy: SheetEnergy, log_factor: Float[Array, " k"], names: Sequence[str] | None = None) -> SheetEnergy:
+    """Return the energy with some of its `ratios` multiplied by a factor, given by its logarithm; differentiable.
 
     The bed supports the new weight in the same shape in which it supported the old one.
+
+    Args:
+        energy: of the sheet.
+        log_factor: logarithm of each factor [nat].
+        names: the ratios that the factors are of; all of `ratios` if None.
     """
-    factor = dict(zip(ratios(energy), jnp.exp(log_factor), strict=True))
+    names = ratios(energy) if names is None else names
+    factor = dict.fromkeys(ratios(energy), jnp.ones((), log_factor.dtype))
+    factor |= dict(zip(names, jnp.exp(log_factor), strict=True))
 
     def scale(term: Term) -> Term:
         if isinstance(term, Weight):

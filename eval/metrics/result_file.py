@@ -166,7 +166,7 @@ def read_scorable(
     if estimated.belief is None or estimated.detection is None:
         raise OutputError(f"{directory / 'estimate.mcap'} ends before its belief; estimate the recording again.")
     truth = read_truth(truth_path, allow_truncated=allow_truncated)
-    _refuse_other_figures(unscored, estimated, directory)
+    refuse_other_figures(unscored, estimated, directory)
     if estimated.metadata.get(RECORDED, truth.scene) != truth.scene:
         raise RecordingError(
             f"{truth_path} is the truth of '{truth.scene}', and {directory} the estimate of "
@@ -183,8 +183,12 @@ def read_scorable(
     return unscored, estimated, truth
 
 
-def _refuse_other_figures(figures: Json, estimated: EstimateRecording, directory: Path) -> None:
-    """Refuse a result that is of another estimate than the one beside it."""
+def refuse_other_figures(figures: Json, estimated: EstimateRecording, directory: Path) -> None:
+    """Refuse a result that is of another estimate than the one beside it.
+
+    Raises:
+        RecordingError: they differ in their number of particles.
+    """
     n = len(estimated.sheet.rest)
     if figures["n_particles"] != n:
         raise RecordingError(

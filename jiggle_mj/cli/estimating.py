@@ -1,14 +1,14 @@
 """The verbs `run`, `estimate`, `identify`, `close-loop` and `score`: estimation, model errors and scores."""
 
+import itertools
 import json
-from dataclasses import asdict
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
 from ..errors import OptionError, RecordingError
 from ..options import FilterName, PolicyName, Sensing
+from .material import material_json, show_material
 from .options import (
     AS_DECLARED,
     AS_RECORDED,
@@ -16,6 +16,7 @@ from .options import (
     Disturb,
     Name,
     Out,
+    Parameters,
     PathArgument,
     RecordingOptions,
     RecordingSettings,
@@ -24,9 +25,10 @@ from .options import (
 )
 from .settings import configured, declared
 from .survey import doubt
-from .terminal import INTERRUPTED, console, deferred_interrupt, progress, show, stop
+from .terminal import INTERRUPTED, console, deferred_interrupt, log, progress, show, stop
 
 if TYPE_CHECKING:
+    from jiggle_mj.estimator import Estimator
     from jiggle_mj.estimator.perception import FrameMask, TissueMask
 
     from ..recording.reader import Recording
@@ -147,59 +149,43 @@ def estimate(
 
 
 def identify(
-    recording: PathArgument,
+    source: PathArgument,
     /,
     *,
+    parameter: Parameters = (),
     settings: RecordingSettings = AS_RECORDED,
     allow_truncated: bool = False,
     as_json: AsJson = False,
 ) -> None:
-    """Identify the sheet's weight and bending stiffness, relative to its membrane stiffness, from a recording.
+    """Identify the sheet's weight and bending stiffness, relative to its membrane stiffness.
 
     Args:
-        recording: an MCAP file of observations.
+        source: an MCAP file of observations; or the output folder of 'run' or 'estimate', whose frames are used again
+            without tracking them, with the settings of that estimate.
+        parameter: weight or bending; the other stays as declared. Both if left out. May be repeated.
         settings: what is declared of the tissue, how the estimator is set, and which pixels are tissue.
         allow_truncated: use the complete frames of a recording that was cut off.
         as_json: print the ratios, the refusals and the resulting declaration to stdout as JSON.
     """
-    from jiggle_mj.estimator import Estimator
-    from jiggle_mj.eval.runs.check_before import check_before
-    from jiggle_mj.eval.runs.mask_files import mask_shown
-    from jiggle_mj.eval.runs.settings_used import with_declared
+    from ..material import check_ratios
 
-    from .. import episode
-    from ..recording.reader import Recording
+    check_ratios(parameter)
+    passes = itertools.count(1)
 
-    config, declare = configured(settings.config, settings.set, "implicit"), declared(settings.declare)
-    tolerance_ns = in_ns(settings.pairing_tolerance)
-    source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
-    mask = _mask(settings, source)
-    check_before(source, recording, declare, allow_implausible=settings.allow_implausible, log=doubt)
-    estimator = Estimator(with_declared(source.declaration, declare), source.camera, config=config, mask=mask)
-    with mask_shown(Path()), progress(len(source), f"estimate {recording.name}") as on_frame:
-        episode.estimate(source, estimator, on_frame=on_frame)
-    with console.status("weight and bending") as status:
-        material = estimator.identify(
-            on_pass=lambda factors: status.update(", ".join(f"{name} x {x:.3g}" for name, x in factors.items()))
-        )
-    table = Table("over the membrane stiffness", "unit", "declared", "identified", "standard error", box=None)
-    for name, ratio in material.ratios.items():
-        reliable = ratio.refused is None
-        cells = (f"{ratio.declared * ratio.factor:.3g}", f"{100 * ratio.log_sd:.1f} %") if reliable else ("-", "-")
-        table.add_row(name, ratio.unit, f"{ratio.declared:.3g}", *cells)
-    console.print(table)
-    for name, why in material.refused.items():
-        console.print(f"{name}: not identified; {why}.", highlight=False)
-    declaration = material.declaration
-    console.print(
-        f"If the sheet weighs the declared {declaration.areal_density:g} kg/m^2: membrane_stiffness = "
-        f"{declaration.membrane_stiffness:.3g} N/m, and thickness = {declaration.thickness:.3g} m for its bending.",
-        highlight=False,
-    )
+    def on_pass(factors: dict[str, float]) -> None:
+        console.print(f"pass {next(passes)}: {_factors(factors)}", highlight=False)
+
+    if source.is_dir():
+        from jiggle_mj.eval.runs.identifying import identify_folder
+
+        _refuse_for_folder(settings, allow_truncated=allow_truncated)
+        declare = declared(settings.declare)
+        material = identify_folder(source, parameters=parameter, declare=declare, on_pass=on_pass, log=log)
+    else:
+        material = _followed(source, settings, allow_truncated=allow_truncated).identify(parameter, on_pass=on_pass)
+    show_material(material)
     if as_json:
-        ratios = {name: asdict(ratio) for name, ratio in material.ratios.items()}
-        identified = {name: getattr(declaration, name) for name in ("membrane_stiffness", "thickness", "areal_density")}
-        print(json.dumps({"ratios": ratios, "refused": material.refused, "declaration": identified}))
+        print(json.dumps(material_json(material)))
 
 
 def close_loop(
@@ -286,6 +272,48 @@ def score(
         raise RecordingError(f"{truth} does not exist; 'import' writes one where recording.toml has a [truth].")
     figures = score_directory(directory, truth, recording=recording, allow_truncated=allow_truncated, log=console.print)
     show(figures, directory, as_json)
+
+
+def _followed(recording: Path, settings: RecordingOptions, *, allow_truncated: bool) -> "Estimator":
+    """Return an estimator that has followed a recording.
+
+    Raises:
+        JiggleError: what any of the parts raises.
+    """
+    from jiggle_mj.estimator import Estimator
+    from jiggle_mj.eval.runs.check_before import check_before
+    from jiggle_mj.eval.runs.mask_files import mask_shown
+    from jiggle_mj.eval.runs.settings_used import with_declared
+
+    from .. import episode
+    from ..recording.reader import Recording
+
+    config, declare = configured(settings.config, settings.set, "implicit"), declared(settings.declare)
+    tolerance_ns = in_ns(settings.pairing_tolerance)
+    source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
+    mask = _mask(settings, source)
+    check_before(source, recording, declare, allow_implausible=settings.allow_implausible, log=doubt)
+    estimator = Estimator(with_declared(source.declaration, declare), source.camera, config=config, mask=mask)
+    with mask_shown(Path()), progress(len(source), f"estimate {recording.name}") as on_frame:
+        episode.estimate(source, estimator, on_frame=on_frame)
+    return estimator
+
+
+def _refuse_for_folder(settings: RecordingOptions, *, allow_truncated: bool) -> None:
+    """Refuse options that say how a recording is followed, where none is.
+
+    Raises:
+        OptionError: one is given.
+    """
+    given = [item.name for item in fields(settings) if getattr(settings, item.name) != getattr(AS_RECORDED, item.name)]
+    refused = [name for name in (*given, *(["allow_truncated"] if allow_truncated else [])) if name != "declare"]
+    if refused:
+        option = refused[0].replace("_", "-")
+        raise OptionError(f"--{option}: an estimate is used as it was made; leave it out, or give the recording.")
+
+
+def _factors(factors: dict[str, float]) -> str:
+    return ", ".join(f"{name} x {factor:.3g}" for name, factor in factors.items())
 
 
 def _mask(settings: RecordingOptions, source: "Recording") -> "TissueMask | FrameMask | None":

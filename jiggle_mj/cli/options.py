@@ -15,6 +15,7 @@ RowsName = Literal["inside", "together", "images", "outside", "nothing"]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 AsJson = Annotated[bool, tyro.conf.arg(name="json")]
 Disturb = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[=MAGNITUDE]")]]
+Parameters = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")]]
 PAIRING_TOLERANCE_MS = 5.0
 """Largest difference of the stamps of one frame if none is given [ms]; a robot's sensors stamp a few ms apart."""
 

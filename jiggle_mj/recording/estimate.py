@@ -22,10 +22,11 @@ from jaxtyping import Float
 from mcap.records import Message
 
 from ..errors import RecordingError
-from ..estimate import Belief, Detection, Estimate, Sheet
+from ..estimate import Belief, Detection, Estimate, KeptFrames, Sheet
 from ..toml_kinds import count, flag, number, text
 from .declaration import METADATA, file_metadata
 from .json_values import entry, optional, parse_list, parse_object
+from .kept_frames import KEPT_FRAMES, MAX_KEPT_BYTES, frames_from_arrays, frames_to_arrays
 from .mcap_files import McapOutput, read_arrays
 from .messages import checked_stamp, parse_message, read_messages, refuse_disorder
 from .schemas import WORLD, fill_pose, parse_points, point_cloud, timestamp
@@ -110,15 +111,25 @@ class EstimateWriter:
         )
         output.flush()
 
-    def finish(self, belief: Belief, detection: Detection, *, skipped: Sequence[tuple[int, str]] = ()) -> None:
+    def finish(
+        self,
+        belief: Belief,
+        detection: Detection,
+        *,
+        skipped: Sequence[tuple[int, str]] = (),
+        frames: KeptFrames | None = None,
+    ) -> None:
         """Write the final belief and detection, and close the file.
 
         Args:
             belief: the belief after the last frame.
             detection: the particles called attached by that belief.
             skipped: index and reason of each observation that was not used.
+            frames: what `identify` needs to use the estimate again; left out above `MAX_KEPT_BYTES`.
         """
         output = self._output
+        if frames is not None and frames.nbytes <= MAX_KEPT_BYTES:
+            output.arrays(KEPT_FRAMES, frames_to_arrays(frames))
         for name, result, excluded in ((BELIEF, belief, ()), (DETECTION, detection, ("rule",))):
             values = {field.name: getattr(result, field.name) for field in fields(result) if field.name not in excluded}
             output.arrays(name, {key: np.asarray(value) for key, value in values.items() if value is not None})
@@ -147,6 +158,8 @@ class EstimateRecording:
     """Index and reason of each observation that was not used."""
     metadata: dict[str, str]
     """Versions, units and the settings of the estimator."""
+    frames: KeptFrames | None = None
+    """What the filter kept of its frames; None where it is not stored."""
 
 
 def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False) -> EstimateRecording:
@@ -161,7 +174,7 @@ def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False
         raise RecordingError(f"{path} is not an estimate: it lacks {SHEET}; its topics are: {content.topics}.")
     arrays = {
         name: StoredArrays(read_arrays(content.attachments[name], path), f"{path}: {name}")
-        for name in (SHEET, BELIEF, DETECTION)
+        for name in (SHEET, BELIEF, DETECTION, KEPT_FRAMES)
         if name in content.attachments
     }
     rest = arrays[SHEET].positions("rest", (None, 3), finite=True)
@@ -182,6 +195,7 @@ def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False
         detection=_detection(arrays[DETECTION], result, n, path) if finished and result else None,
         skipped=_skipped(result, path) if result else (),
         metadata=content.metadata.get(METADATA, {}),
+        frames=frames_from_arrays(arrays[KEPT_FRAMES], n, str(path)) if KEPT_FRAMES in arrays else None,
     )
 
 

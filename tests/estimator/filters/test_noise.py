@@ -112,3 +112,16 @@ def surprise(summary: PosteriorSummary) -> float:
     """Return the mean negative log probability of the truth by P(attached) [nat]."""
     of_truth = np.where(attached(), summary.probability, 1 - np.asarray(summary.probability))
     return float(-np.mean(np.log(of_truth)))
+
+
+def test_an_error_that_all_grasps_share_counts_by_its_sum_over_all():
+    """The same residual in g grasps adds up to |sum|^2 that is g times what the noise of each grasp allows."""
+    unit = ForceResiduals(
+        force=jnp.zeros((10, 3)),
+        force_degrees=jnp.asarray(30.0),
+        position=jnp.ones((10, 3)),
+        position_degrees=jnp.asarray(30.0),
+    )
+    opposite = eqx.tree_at(lambda residuals: residuals.position, unit, -unit.position)
+    assert Noise.shared([unit] * 4) == Noise(force=1.0, position=4.0)
+    assert Noise.shared([unit, opposite]) == Noise()

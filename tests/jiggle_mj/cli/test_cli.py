@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from jiggle_mj.recording.estimate import EstimateWriter, read_estimate
 from tests.support.result_keys import KEYS, KEYS_OF_POINTS, keys
 from tests.support.tiny_scene import SCENE, call, scene_file
 
@@ -111,15 +112,73 @@ def test_a_folder_with_results_is_refused_with_2_and_replaced_on_demand(particle
     assert (out / "run.mcap").exists() and (out / "run.truth.mcap").exists()
 
 
-def test_identify_prints_ratios_and_what_it_refuses(particles, monkeypatch, capsys):
-    assert call(monkeypatch, "identify", particles, "--json") == 0
-    printed = capsys.readouterr()
-    material = json.loads(printed.out)
-    assert set(material["ratios"]) == {"weight", "bending"} and "membrane stiffness" in material["refused"]
+@pytest.fixture(scope="module")
+def estimated(particles):
+    """The folder of an estimate of the recording of particles."""
+    out = particles.parent / "estimated"
+    with pytest.MonkeyPatch.context() as patch:
+        assert call(patch, "estimate", particles, "--out", out) == 0
+    return out
+
+
+def check_material(material: dict, names: set[str], said: str) -> None:
+    assert set(material["ratios"]) == names and "membrane stiffness" in material["refused"]
     for name, ratio in material["ratios"].items():
-        assert ratio["factor"] > 0 and ratio["log_sd"] > 0
-        assert (ratio["refused"] is not None) == (name in material["refused"])
-    assert "membrane stiffness: not identified" in printed.err and "1/m" in printed.err
+        assert ratio["log_sd"] > 0 and ratio["trades_with"] and 0 <= ratio["correlation"] <= 1
+        assert (ratio["factor"] is None) == (ratio["refused"] is not None) == (name in material["refused"])
+        assert ratio["factor"] is None or ratio["factor"] > 0
+    assert "membrane stiffness: not identified" in said and "pass 1: " in said
+
+
+def test_identify_uses_an_estimate_again_and_says_what_it_cannot_know(estimated, monkeypatch, capsys):
+    assert call(monkeypatch, "identify", estimated, "--json") == 0
+    printed = capsys.readouterr()
+    said = " ".join(printed.err.split())
+    check_material(json.loads(printed.out), {"weight", "bending"}, said)
+    assert "are used again" in said and "1/m" in said
+
+
+@pytest.mark.slow
+def test_identify_finds_the_same_from_the_recording_and_one_parameter_alone(particles, estimated, monkeypatch, capsys):
+    """The same frames within the length of the last step, a tenth of the standard error, from either side."""
+    found = []
+    for source in (particles, estimated):
+        assert call(monkeypatch, "identify", source, "--json", "--parameter", "weight") == 0
+        printed = capsys.readouterr()
+        check_material(json.loads(printed.out), {"weight"}, printed.err)
+        found.append(json.loads(printed.out)["ratios"]["weight"])
+    assert abs(np.log(found[0]["factor"] / found[1]["factor"])) < 0.2 * found[0]["log_sd"]
+    assert np.isclose(found[0]["log_sd"], found[1]["log_sd"], rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (("--parameter", "bending_ratio"), 2, "did you mean 'bending'?"),
+        (("--parameter", "gravity"), 2, "only weight and bending can be identified"),
+        (("--mask", "grabcut"), 2, "--mask: an estimate is used as it was made"),
+        (("--set", "spacing=0.01"), 2, "--set: an estimate is used as it was made"),
+        (("--allow-truncated",), 2, "--allow-truncated: an estimate is used as it was made"),
+    ],
+)
+def test_what_cannot_be_asked_of_an_estimate_is_refused_in_one_line(
+    options, code, said, estimated, monkeypatch, capsys
+):
+    assert call(monkeypatch, "identify", estimated, *options) == code
+    assert said in one_line(capsys.readouterr().err)
+
+
+def test_a_folder_without_kept_frames_is_refused_with_what_to_give_instead(estimated, tmp_path, monkeypatch, capsys):
+    read = read_estimate(estimated / "estimate.mcap")
+    with EstimateWriter(tmp_path / "estimate.mcap", read.sheet, read.metadata) as writer:
+        for each in read.estimates:
+            writer.write(each)
+        writer.finish(read.belief, read.detection)
+    shutil.copy(estimated / "result.json", tmp_path)
+    assert call(monkeypatch, "identify", tmp_path) == 2
+    assert "does not keep its frames" in one_line(capsys.readouterr().err)
+    assert call(monkeypatch, "identify", tmp_path / "nothing") == 1
+    assert "nothing" in one_line(capsys.readouterr().err)
 
 
 def test_a_run_that_cannot_begin_leaves_the_old_results(complete_run, monkeypatch, capsys):

@@ -8,12 +8,13 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 from jiggle_mj.errors import OutputError, RecordingError
-from jiggle_mj.estimate import Belief, Detection, Estimate, Sheet
+from jiggle_mj.estimate import Belief, Detection, Estimate, KeptFrames, Sheet
 from jiggle_mj.recording.estimate import (
     BELIEF,
     DETECTION,
     RESULT_RECORD,
     SHEET,
+    EstimateRecording,
     EstimateWriter,
     read_estimate,
     stiffness_colours,
@@ -97,6 +98,49 @@ def test_same_estimate_gives_same_bytes_whatever_the_clock_said(tmp_path):
             writer.write(estimate(0, update_s=seconds, perception_s=2 * seconds))
             writer.finish(belief(), detection())
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def kept() -> KeptFrames:
+    generator = np.random.default_rng(3)
+    root = generator.normal(size=(3, N, 3, 3))
+    return KeptFrames(
+        grasp=np.array([0, 0, 1]),
+        x=generator.normal(size=(3, N, 3)),
+        y=generator.normal(size=(3, N, 3)),
+        precision=root @ np.swapaxes(root, 2, 3),
+        held=generator.uniform(size=(3, N)) > 0.5,
+        force_unknown=generator.uniform(size=(3, N)) > 0.5,
+        fields=generator.normal(size=(N, 2)),
+    )
+
+
+def written_with(path, frames: KeptFrames) -> EstimateRecording:
+    with EstimateWriter(path, sheet(), {}) as writer:
+        writer.write(estimate(0))
+        writer.finish(belief(), detection(), frames=frames)
+    return read_estimate(path)
+
+
+@pytest.mark.parametrize("changes", [{}, {"fields": None}])
+def test_kept_frames_are_read_back_exactly(tmp_path, changes):
+    given = replace(kept(), **changes)
+    read = written_with(tmp_path / "estimate.mcap", given).frames
+    assert read is not None
+    for f in fields(KeptFrames):
+        np.testing.assert_array_equal(getattr(read, f.name), getattr(given, f.name))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"grasp": np.array([1, 0, 1])},
+        {"x": np.full((3, N, 3), np.nan)},
+        {"precision": -kept().precision},
+    ],
+)
+def test_damaged_frames_are_refused(tmp_path, changes):
+    with pytest.raises(RecordingError, match=r"frames\.npz|is damaged"):
+        written_with(tmp_path / "estimate.mcap", replace(kept(), **changes))
 
 
 def test_an_unfinished_estimate_has_no_belief(tmp_path):
