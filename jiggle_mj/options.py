@@ -28,5 +28,8 @@ PolicyName = Literal[
 (`one-grasp`); our two procedures (`detach`, `suture`); the paper's."""
 POLICIES: tuple[PolicyName, ...] = get_args(PolicyName)
 """Every policy."""
+CalibrationReference = Literal["assumed", "exact", "mujoco"]
+"""What makes the data of simulation-based calibration: our own engine with the errors that the filter assumes, our own
+engine without errors of forces, the reference tissue."""
 PRIMITIVES: tuple[PolicyName, ...] = tuple(name for name in POLICIES if name.startswith("pmp-"))
 """The paper's policies that pull in one fixed direction, whatever is observed."""

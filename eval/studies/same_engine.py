@@ -9,7 +9,7 @@ Every grasp begins at rest, and springs as in the estimator's model hold the gra
 The estimator gets the mesh, and which particles are held. It sees every particle with noise, which a seed draws.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from jiggle_mj.actions import Action, Grasp, Move, Release
 from jiggle_mj.estimator import EstimatorConfig
@@ -68,7 +68,7 @@ class SameEngine:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Moment:
+class Moment:
     """One frame without noise."""
 
     x: Float[np.ndarray, "n 3"]
@@ -121,7 +121,7 @@ def sheet(scene: Scene) -> tuple[SheetMesh, Bool[np.ndarray, " n"]]:
 
 
 @cache
-def _moments(scene: Scene, engine: Engine, grasps: int, stiffness: float) -> tuple[Declaration, tuple[_Moment, ...]]:
+def _moments(scene: Scene, engine: Engine, grasps: int, stiffness: float) -> tuple[Declaration, tuple[Moment, ...]]:
     """Return the declaration and all frames; the same for every seed."""
     mesh, attached = sheet(scene)
     declared_mesh = DeclaredMesh(vertices=mesh.rest, faces=mesh.faces, track_id=np.arange(mesh.n))
@@ -131,10 +131,10 @@ def _moments(scene: Scene, engine: Engine, grasps: int, stiffness: float) -> tup
     with jax.enable_x64(True), one_thread():
         b = jnp.asarray(stiffness * declaration.membrane_stiffness * attached)
         step = (_xpbd if engine == "xpbd" else _equilibrium)(mesh, declaration, b)
-        return declaration, tuple(_executed(_actions(scene, grasps), mesh, declaration, step))
+        return declaration, tuple(executed(lifts(scene, grasps), mesh, declaration, step))
 
 
-def _actions(scene: Scene, grasps: int) -> Iterator[Action]:
+def lifts(scene: Scene, grasps: int) -> Iterator[Action]:
     """Yield the scene's programme with the paper's lifts."""
     height = LIFT_SHARE * scene.tissue.size[0]
     plan = replace(scene.programme, height=height, increments=LIFT_INCREMENTS, still_frames=1, lowering=0)
@@ -147,8 +147,27 @@ def _actions(scene: Scene, grasps: int) -> Iterator[Action]:
             yield action
 
 
-def _executed(actions: Iterator[Action], mesh: SheetMesh, declaration: Declaration, step) -> Iterator[_Moment]:
-    """Yield the frame after each action."""
+Step = Callable[[Float[np.ndarray, "n 3"], Grip], Float[np.ndarray, "n 3"]]
+"""Function that returns the positions after a move of the grip from those before it [m]."""
+
+
+def executed(
+    actions: Iterator[Action],
+    mesh: SheetMesh,
+    declaration: Declaration,
+    step: Step,
+    *,
+    closed: Step = lambda rest, _: rest,
+) -> Iterator[Moment]:
+    """Yield the frame after each action.
+
+    Args:
+        actions: what the tool does.
+        mesh: the sheet.
+        declaration: its membrane stiffness gives that of the grip.
+        step: moves the sheet after each move of the tip.
+        closed: moves the sheet when the jaws close; by default it stays at rest.
+    """
     grip, x, stiff = None, mesh.rest, EstimatorConfig().grip_stiffness * declaration.membrane_stiffness
     tool = ToolState(position=OPEN_TIP, quat_wxyz=np.eye(4)[0], closed=False, grasp=0, radius=OPEN_RADIUS)
     for action in actions:
@@ -159,10 +178,11 @@ def _executed(actions: Iterator[Action], mesh: SheetMesh, declaration: Declarati
             tool = replace(
                 tool, position=action.point, closed=True, grasp=tool.grasp + 1, radius=action.radius, held_tracks=held
             )
+            x = closed(x, grip)
         elif isinstance(action, Move) and grip is not None:
             tool = replace(tool, position=action.to)
             x = step(x, eqx.tree_at(lambda g: g.tip, grip, jnp.asarray(action.to)))
-        yield _Moment(x=x, tool=tool)
+        yield Moment(x=x, tool=tool)
 
 
 def _xpbd(mesh: SheetMesh, declaration: Declaration, b):
@@ -173,16 +193,23 @@ def _xpbd(mesh: SheetMesh, declaration: Declaration, b):
 
 def _equilibrium(mesh: SheetMesh, declaration: Declaration, b):
     """Return the search for argmin U from the frame before."""
-    energy, search = surrogate(mesh, declaration), eqx.filter_jit(equilibrium)
+    energy = surrogate(mesh, declaration)
+    return lambda x, grip: settled(SheetEnergy.build(mesh.rest, (*energy.terms, grip), energy.layout), b, x)
 
-    def step(x, grip):
-        gripped = SheetEnergy.build(mesh.rest, (*energy.terms, grip), energy.layout)
-        found = search(gripped, b, jnp.asarray(x), force_tolerance=FORCE_TOLERANCE, max_steps=MAX_EQUILIBRIUM_STEPS)
-        if not found.converged:
-            raise RuntimeError(
-                f"the equilibrium of the truth did not converge: the residual is {float(found.force):.2g} N after "
-                f"{found.steps} steps; {FORCE_TOLERANCE:g} N is allowed."
-            )
-        return np.asarray(found.x)
 
-    return step
+_search = eqx.filter_jit(equilibrium)
+
+
+def settled(energy: SheetEnergy, b: Float[Array, " n"], x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return the equilibrium that a search from x reaches [m].
+
+    Raises:
+        RuntimeError: it did not converge.
+    """
+    found = _search(energy, b, jnp.asarray(x), force_tolerance=FORCE_TOLERANCE, max_steps=MAX_EQUILIBRIUM_STEPS)
+    if not found.converged:
+        raise RuntimeError(
+            f"the equilibrium of the truth did not converge: the residual is {float(found.force):.2g} N after "
+            f"{found.steps} steps; {FORCE_TOLERANCE:g} N is allowed."
+        )
+    return np.asarray(found.x)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ..options import Sensing
+from ..options import CalibrationReference, Sensing
 from .options import Out, RowsName
 from .terminal import console, log
 
@@ -95,6 +95,32 @@ class _Undeclared(_TableOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Calibration(_TableOptions):
+    """Simulation-based calibration: where truths drawn from the prior lie in their posteriors.
+
+    The plots are in OUT/calibration.html.
+    """
+
+    seeds: tuple[int, ...] | None = None
+    """Seeds of the draws from the prior; 0 to 99 if left out."""
+    references: tuple[CalibrationReference, ...] | None = None
+    """What makes the data: our own engine with the errors that the filter assumes, our own engine without errors of
+    forces, or MuJoCo; all if left out."""
+    jobs: int | None = None
+    """Number of draws at a time; the number of usable cores if left out."""
+
+    def run(self) -> None:
+        from jiggle_mj.eval.report.calibration_page import PAGE, write_calibration_page
+        from jiggle_mj.eval.studies.drawn_pulls import REFERENCES
+        from jiggle_mj.eval.studies.simulation_based_calibration import CalibrationStudy, summaries
+
+        study = CalibrationStudy(references=self.references or REFERENCES)
+        found = _print_table(study, self, self.seeds, self.jobs, parallel=True)
+        write_calibration_page(self.out / PAGE, summaries(found))
+        console.print(f"plots: {self.out / PAGE}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Scalability(_TableOptions):
     """Seconds of a plan at three sizes, on this machine."""
 
@@ -136,6 +162,7 @@ Tables = (
     | Annotated[_Active, tyro.conf.subcommand("active")]
     | Annotated[_Acts, tyro.conf.subcommand("acts")]
     | Annotated[_Undeclared, tyro.conf.subcommand("undeclared")]
+    | Annotated[_Calibration, tyro.conf.subcommand("calibration")]
     | Annotated[_Scalability, tyro.conf.subcommand("scalability")]
     | Annotated[_Simulation, tyro.conf.subcommand("simulation")]
     | Annotated[_OneLift, tyro.conf.subcommand("one-lift")]
