@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from .material import Material as Material
     from .observation import Declaration as Declaration
     from .observation import DeclaredMesh as DeclaredMesh
+    from .observation import MeasuredForce as MeasuredForce
     from .observation import MeasuredPoints as MeasuredPoints
     from .observation import Observation as Observation
     from .observation import StereoPair as StereoPair
@@ -82,6 +83,7 @@ __all__ = [
     "Grasp",
     "JiggleError",
     "Material",
+    "MeasuredForce",
     "MeasuredPoints",
     "MeshError",
     "Move",
@@ -148,7 +150,15 @@ _NAMES_OF_MODULE = {
     "eval.metrics.result": ("score",),
     "importing.folder": ("import_folder",),
     "material": ("Material",),
-    "observation": ("Declaration", "DeclaredMesh", "MeasuredPoints", "Observation", "StereoPair", "ToolState"),
+    "observation": (
+        "Declaration",
+        "DeclaredMesh",
+        "MeasuredForce",
+        "MeasuredPoints",
+        "Observation",
+        "StereoPair",
+        "ToolState",
+    ),
     "plausibility.problem": ("RecordingProblem",),
     "plausibility.problems": ("problems",),
     "plausibility.survey": ("Survey", "survey"),

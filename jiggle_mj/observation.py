@@ -171,6 +171,27 @@ class ToolReport:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MeasuredForce:
+    """The force on the tool as a sensor measured it.
+
+    Raises:
+        ObservationError: the force is not three finite numbers, or the noise is not above 0.
+    """
+
+    on_tool: Float[np.ndarray, " 3"]
+    """Force of the tissue on the tool in the world frame [N], with the sensor's offset and the tool's own weight."""
+    sd: float | None = None
+    """Standard deviation of the noise of each component [N]; None where nobody states it."""
+
+    def __post_init__(self) -> None:
+        """Check force and noise."""
+        name, error = "MeasuredForce", ObservationError
+        store(self, on_tool=as_array(self.on_tool, f"{name}.on_tool [N]", (3,), error=error))
+        if self.sd is not None:
+            store(self, sd=as_number(self.sd, f"{name}.sd", unit="N", above=0, error=error))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Observation:
     """The tool, and images or measured points, at one time; where there are both, the estimator uses the images.
 
@@ -192,6 +213,8 @@ class Observation:
     """The measured points; None where the recording has images only."""
     events: tuple[Cut | Suture, ...] = ()
     """Intended cuts and sutures since the observation before."""
+    force: MeasuredForce | None = None
+    """The force on the tool; None where none is measured."""
 
     def __post_init__(self) -> None:
         """Check the type of every field."""
@@ -201,6 +224,8 @@ class Observation:
             as_instance(self.images, "Observation.images", StereoPair, error=error)
         if self.points is not None:
             as_instance(self.points, "Observation.points", MeasuredPoints, error=error)
+        if self.force is not None:
+            as_instance(self.force, "Observation.force", MeasuredForce, error=error)
         store(
             self,
             index=as_integer(self.index, "Observation.index", at_least=0, error=error),

@@ -34,6 +34,7 @@ from .points.headings import PIXELS
 from .points.measured import PointFrames, is_planar
 from .recording_toml import MeasuredRecording, read_recording_toml
 from .tool import Tool
+from .tool_force import read_force
 from .units import LENGTH_UNITS, LIKELY_EXTENT, PIXELS_ARE_NO_LENGTH, likely_unit
 
 MIN_EXTENT, MAX_EXTENT = 2e-3, 2.0
@@ -110,6 +111,8 @@ def import_folder(
     mesh = declared_mesh(data, given, rest, found.notes)
     vertices = None if mesh is None else mesh.vertices
     tool = Tool.read(data, given, frames, names=names, steps=steps, clock=clock, vertices=vertices)
+    order = [step + given.points.rest for step in steps]
+    forces = read_force(data, given.force, given.points.files[0], rotation=given.frame.rotation, order=order)
     name = identity(given.name, frames)
     truth = measured_truth(data, given, rest, mesh, name)
     skipped: list[tuple[str, str]] = []
@@ -134,6 +137,7 @@ def import_folder(
                         time=time,
                         tool=tool.state(number, positions),
                         reports=tool.reported(previous_time, time),
+                        force=forces[number],
                         points=MeasuredPoints(
                             positions=positions,
                             track_id=np.arange(len(rest)),

@@ -27,6 +27,7 @@ from .data_folder import quoted
 from .grasp_table import GraspTable, Rows, read_choice, read_grasps
 from .points.points_table import PointFiles, read_points_table
 from .points.text_lines import read_text
+from .tool_force import GivenForce, read_force_table
 from .units import LENGTH_UNITS, TIME_UNITS, unit_of
 
 MAX_ROTATION_ERROR = 2e-5
@@ -121,6 +122,8 @@ class MeasuredRecording:
     """Continuation of the sheet all around; None for none."""
     grasp: GraspTable
     """The grasps, and what gives the position of the tool."""
+    force: GivenForce | None
+    """The force on the tool; None where none was measured."""
     attached: Rows | Region | float | None
     """Truth for scoring: rows, a region, or the station beyond which all is attached; None where the truth is
     unknown."""
@@ -190,6 +193,7 @@ def _recording(top: StrictTable) -> MeasuredRecording:
         extension=_extension(extend) if extend.given else None,
         margin=_margin(mesh),
         grasp=read_grasps(top),
+        force=read_force_table(top.table("force", optional=True)),
         attached=_attached(truth),
         truth_details=_details(truth),
         declaration=parse_declaration_table(top.table("declaration", optional=True)),

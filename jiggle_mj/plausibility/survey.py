@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..camera import StereoCamera
-from ..observation import ToolState
+from ..observation import MeasuredForce, ToolState
 from ..recording.reader import Recording
 from .closed_tool import NS, ClosedTool
 from .declaration_problems import declaration_problems
+from .force_problems import force_problems
 from .grip_share import grip_share
 from .held_motion import HeldMotion
 from .image_problems import image_problems
@@ -113,6 +114,7 @@ def survey(recording: Recording) -> Survey:
     motion, closed, times, track = PointMotion(), ClosedTool(), list[int](), HeldMotion()
     shares, distances, mesh = list[float](), list[float](), recording.declaration.mesh
     tools: list[tuple[int, ToolState]] = []
+    forces: list[tuple[ToolState, MeasuredForce | None]] = []
     stride = max(1, len(recording) // COMPARED_FRAMES)
     first_cloud: Float[np.ndarray, "m 3"] | None = None
     declared_sd: float | None = None
@@ -120,6 +122,7 @@ def survey(recording: Recording) -> Survey:
     for observation in recording.without_images():
         times.append(observation.time)
         tools.append((observation.index, observation.tool))
+        forces.append((observation.tool, observation.force))
         points, held = observation.points, np.full(3, np.nan)
         begins, n_first = closed.begins(observation), 0 if first_cloud is None else len(first_cloud)
         if begins:
@@ -202,7 +205,7 @@ def survey(recording: Recording) -> Survey:
         tool_depth_m=depth,
         tool_disparity_px=disparity,
         tool_in_view=in_view,
-        doubts=(*doubts, *image_problems(recording, tools)),
+        doubts=(*doubts, *image_problems(recording, tools), *force_problems(recording, forces)),
         declared=recording.declared,
         mesh_declared=mesh is not None,
     )

@@ -22,13 +22,14 @@ from ..observation import Declaration
 from .bag_refusal import refuse_bag
 from .declaration import DECLARATION, DECLARED_MESH, METADATA, parse_declaration, with_mesh
 from .events import parse_event
+from .force import ToolForce, parse_force
 from .frames import FrameTree
 from .mcap_files import iterate_records
 from .messages import checked_stamp, parse_message
 from .pairing import Stamped
 from .refusals import refuse_incomplete, refuse_truth
 from .schemas import parse_grasp, stamp_of
-from .topics import EVENT, GRASP, JSON_TOPICS, LEFT, POINTS, POSE, RIGHT, SCHEMAS
+from .topics import EVENT, FORCE, GRASP, JSON_TOPICS, LEFT, POINTS, POSE, RIGHT, SCHEMAS
 
 MAX_MESSAGES = 1_000_000
 """Most messages of the topics that are read: a report of the tool each ms for a quarter of an hour, 1 GB in memory."""
@@ -53,7 +54,10 @@ class RecordingContents:
         self.stamped: dict[str, list[Stamped]] = {topic: [] for topic in (LEFT, RIGHT, POINTS, POSE, GRASP)}
         self.events: list[tuple[int, Cut | Suture]] = []
         """Cuts and sutures, each with its stamp [ns], by stamp."""
+        self.forces: list[ToolForce] = []
+        """Forces on the tool by time."""
         self._classes: dict[int, Any] = {}
+        self._json: set[int] = set()
         self._declared_mesh: Attachment | None = None
         ignored: Counter[str] = Counter()
         n_read = 0
@@ -66,6 +70,8 @@ class RecordingContents:
                 )
             if topic == EVENT:
                 self.events.append((checked_stamp(message.log_time, topic), parse_event(message.data)))
+            elif topic == FORCE and message.channel_id in self._json:
+                self.forces.append(parse_force(message.data, checked_stamp(message.log_time, topic)))
             elif topic == GRASP or topic in SCHEMAS:
                 self._store(ordinal, topic, message)
             else:
@@ -73,6 +79,7 @@ class RecordingContents:
         if self._declared_mesh is not None:
             self.declaration = with_mesh(self.declaration, self._declared_mesh, path)
         self.events.sort(key=lambda event: event[0])
+        self.forces.sort(key=lambda force: force.time)
         self.ignored = dict(sorted(ignored.items()))
         present = {topic for topic, messages in self.stamped.items() if messages} | set(self.calibrations)
         refuse_incomplete(path, present, self.ignored)
@@ -145,6 +152,8 @@ class RecordingContents:
     def _choose_class(self, channel: Channel, schema: Schema | None) -> None:
         name = (schema.name if schema else "without a schema")[:MAX_SHOWN]
         encoding = channel.message_encoding[:MAX_SHOWN]
+        if encoding == "json":
+            self._json.add(channel.id)
         if channel.topic in JSON_TOPICS and encoding != "json":
             raise RecordingError(f"{self.path}: {channel.topic} is {name} ({encoding}); it must be JSON.")
         if channel.topic not in SCHEMAS:

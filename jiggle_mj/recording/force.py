@@ -1,6 +1,17 @@
-"""Forces on the tool as messages: kept in a recording for other programs; no estimator reads them."""
+"""Forces on the tool as messages: what a sensor measured, at its own times and in its own axes."""
 
 from dataclasses import dataclass
+
+from ..argument_checks import quoted
+from ..errors import RecordingError
+from ..toml_kinds import positive, text, vector
+from .json_values import entry, optional, parse_object
+from .topics import FORCE
+
+TOOL = "/tool/pose"
+"""Name of the frame whose axes are those of the tool's pose."""
+MAX_FORCE_N = 1e4
+"""Largest component of a force that is read [N]: a tonne. Tissue tears at a few N."""
 
 FORCE_SCHEMA: dict[str, object] = {
     "title": "jiggle_mj.Force",
@@ -9,6 +20,7 @@ FORCE_SCHEMA: dict[str, object] = {
         "force": {"type": "array", "items": {"type": "number"}, "description": "x, y, z on the tool [N]"},
         "torque": {"type": "array", "items": {"type": "number"}, "description": "x, y, z on the tool [N m]"},
         "frame_id": {"type": "string", "description": "coordinate frame of the sensor"},
+        "sd": {"type": "number", "description": "standard deviation of the noise of each component of the force [N]"},
     },
     "required": ["force", "torque", "frame_id"],
 }
@@ -21,13 +33,41 @@ class ToolForce:
     time: int
     """Time of the measurement [ns]."""
     force: tuple[float, float, float]
-    """Force on the tool in the sensor's frame [N]."""
+    """Force of the tissue on the tool, in the sensor's frame [N]."""
     torque: tuple[float, float, float]
     """Torque on the tool in the sensor's frame [N m]."""
     frame_id: str
-    """Name of the sensor's frame."""
+    """Name of the sensor's frame; `TOOL` for the axes of the tool's pose."""
+    sd: float | None = None
+    """Standard deviation of the noise of each component of the force [N]; None where it is not stated."""
 
 
 def force_json(force: ToolForce) -> dict[str, object]:
     """Return the message of a force, which follows `FORCE_SCHEMA`."""
-    return {"force": list(force.force), "torque": list(force.torque), "frame_id": force.frame_id}
+    stated = {} if force.sd is None else {"sd": force.sd}
+    return {"force": list(force.force), "torque": list(force.torque), "frame_id": force.frame_id, **stated}
+
+
+def parse_force(data: bytes, time: int) -> ToolForce:
+    """Return the force of a message.
+
+    Args:
+        data: the message.
+        time: its time [ns].
+
+    Raises:
+        RecordingError: not JSON, a field missing or of the wrong kind, or a force of more than a tonne.
+    """
+    value = parse_object(data, FORCE)
+    force, torque = (entry(value, key, vector, FORCE) for key in ("force", "torque"))
+    if max(map(abs, force)) > MAX_FORCE_N:
+        raise RecordingError(
+            f"{FORCE} has force = {quoted(force)}; it is in N, and at most {MAX_FORCE_N:g} N are read (is it in mN?)."
+        )
+    return ToolForce(
+        time=time,
+        force=(force[0], force[1], force[2]),
+        torque=(torque[0], torque[1], torque[2]),
+        frame_id=entry(value, "frame_id", text, FORCE),
+        sd=entry(value, "sd", optional(positive), FORCE, None),
+    )

@@ -3,6 +3,7 @@
 from bisect import bisect_left, bisect_right
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from ..camera import StereoCamera
 from ..errors import RecordingError
-from ..observation import MeasuredPoints, Observation, StereoPair, ToolReport, ToolState
+from ..observation import MeasuredForce, MeasuredPoints, Observation, StereoPair, ToolReport, ToolState
 from ..toml_kinds import MAX_COUNT
 from .contents import RecordingContents
+from .force import TOOL
 from .images import decode_image, refuse_other_size
 from .pairing import MessageGroup, Stamped
 from .schemas import parse_points, parse_transform
 from .stored_arrays import MAX_LENGTH_M, StoredArrays
-from .topics import LEFT, POINTS, POSE, RIGHT
+from .topics import FORCE, LEFT, POINTS, POSE, RIGHT
 
 MAX_SPAN_M = 20.0
 """Largest extent of a cloud [m]: a room. A sheet of 2 cm and more is larger in millimetres."""
@@ -43,7 +45,9 @@ class ObservationReader:
     origin: int
     """Stamp that counts as time 0 [ns]."""
     max_pose_age: int
-    """Age above which a tool pose no longer says where the tool is [ns]."""
+    """Age above which a tool pose no longer says where the tool is, nor a force how hard it pulls [ns]."""
+    tolerance: int
+    """Time up to which a force may come after its frame [ns]."""
 
     def read(self, index: int, group: MessageGroup, messages: dict[str, Any], *, images: bool = True) -> Observation:
         """Decode one group; its events and reports are added by `Recording`.
@@ -62,13 +66,38 @@ class ObservationReader:
         if images and (group.left is not None or group.right is not None):
             pair = self._images(messages)
         points = self._points(messages[POINTS]) if POINTS in messages else None
+        tool = self._tool(group)
         return Observation(
             index=index,
             time=group.stamp - self.origin,
-            tool=self._tool(group),
+            tool=tool,
             images=pair,
             points=points,
+            force=self._force(group.stamp, tool) if self.why_no_force is None else None,
         )
+
+    @cached_property
+    def why_no_force(self) -> str | None:
+        """Why the forces of the file cannot be used; None where they can, or where there is none."""
+        try:
+            for frame in {force.frame_id for force in self.contents.forces} - {TOOL}:
+                self.contents.frames.T_world(frame, FORCE)
+        except RecordingError as failure:
+            return str(failure)
+        return None
+
+    def _force(self, stamp: int, tool: ToolState) -> MeasuredForce | None:
+        """Return the latest force up to the tolerance of poses before a frame, in the world."""
+        forces = self.contents.forces
+        place = bisect_right(forces, stamp + self.tolerance, key=lambda force: force.time)
+        if not place or stamp - forces[place - 1].time > self.max_pose_age:
+            return None
+        force = forces[place - 1]
+        if force.frame_id == TOOL:
+            rotation = Rotation.from_quat(tool.quat_wxyz, scalar_first=True).as_matrix()
+        else:
+            rotation = self.contents.frames.T_world(force.frame_id, FORCE)[:3, :3]
+        return MeasuredForce(on_tool=rotation @ np.array(force.force), sd=force.sd)
 
     def reports(self, after: Stamped | None, until: Stamped | None) -> tuple[ToolReport, ...]:
         """Return the tool's reports strictly between the poses of two observations; malformed poses are left out."""

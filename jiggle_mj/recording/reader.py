@@ -72,6 +72,7 @@ class Recording:
             poses=sorted(stamped[POSE]),
             origin=0 if self.metadata else self._groups[0].stamp,
             max_pose_age=pose_age_ns,
+            tolerance=tolerance_ns,
         )
 
     @classmethod
@@ -98,6 +99,11 @@ class Recording:
             as_path(path, "the recording", error=RecordingError), allow_truncated=allow_truncated
         )
         return cls(contents, tolerance_ns=tolerance_ns, pose_age_ns=pose_age_ns)
+
+    @property
+    def why_no_force(self) -> str | None:
+        """Why the forces on the tool are not used, such as that their frame is unknown; None where they are."""
+        return self._reader.why_no_force
 
     @property
     def seed(self) -> int | None:

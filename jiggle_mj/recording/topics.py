@@ -28,4 +28,4 @@ SCHEMAS: dict[str, tuple[Any, ...]] = {
 }
 """Topics that are read as protobuf, and the message classes allowed on each."""
 FORCE = "/tool/force"
-"""Topic that is kept for other programs and not read."""
+"""Topic of the force on the tool, which is JSON; in another encoding it is ignored."""

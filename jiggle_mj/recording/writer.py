@@ -22,6 +22,7 @@ from .frames import camera_transforms
 from .mcap_files import McapOutput
 from .schemas import (
     GRASP_SCHEMA,
+    WORLD,
     calibration_message,
     grasp_json,
     image_message,
@@ -29,6 +30,9 @@ from .schemas import (
     pose_message,
 )
 from .topics import EVENT, FORCE, GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
+
+NO_TORQUE = (0.0, 0.0, 0.0)
+"""Torque in the message of an observation's force, which has none."""
 
 
 class RecordingWriter:
@@ -100,6 +104,11 @@ class RecordingWriter:
             output.message(RIGHT, time, image_message(time, observation.images.right, "right"))
         if observation.points is not None:
             output.message(POINTS, time, _points_message(time, observation.points))
+        if observation.force is not None:
+            x, y, z = observation.force.on_tool.tolist()
+            self.write_force(
+                ToolForce(time=time, force=(x, y, z), torque=NO_TORQUE, frame_id=WORLD, sd=observation.force.sd)
+            )
         output.flush()
 
     def write_force(self, force: ToolForce) -> None:

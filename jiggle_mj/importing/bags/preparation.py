@@ -1,5 +1,6 @@
 """All that an import knows before it reads the first image: camera, tool, jaws, frames and what to say about them."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from ...camera import CameraCalibration, StereoCamera
 from ...errors import RecordingError
 from ...observation import Declaration, MeasuredPoints
 from ...recording.force import ToolForce
+from ...recording.schemas import WORLD
 from .bag_camera import bag_camera
 from .bag_file import Bag
 from .bag_paths import listed
@@ -20,7 +22,7 @@ from .stamps import refuse_apart
 from .stereo_pairs import pair_images
 from .survey import BagSurvey, survey_bag
 from .tool_track import ToolTrack
-from .transforms import TransformTree
+from .transforms import TransformTree, frame_name
 
 CLOUD_TOLERANCE = 5 * MS
 """Largest difference of the stamps of a cloud and a left image of one frame [ns]."""
@@ -123,7 +125,7 @@ def prepare(
         declaration=declaration,
         tool=tool,
         jaws=_jaws(survey, roles, settings, stamps, notes),
-        forces=_forces(survey),
+        forces=_forces(survey, world, settings.force_sd, notes),
         frames=frames,
         notes=tuple(notes),
     )
@@ -207,17 +209,28 @@ def _jaws(
     return states
 
 
-def _forces(survey: BagSurvey) -> list[ToolForce]:
+def _forces(survey: BagSurvey, world: str, sd: float | None, notes: list[str]) -> list[ToolForce]:
+    """Return the forces on the tool in the world; those whose frame /tf does not join to it keep their own."""
     if "force" not in survey.messages:
         return []
-    times, found = survey.times["force"], []
+    times, found, apart = survey.times["force"], [], Counter[str]()
     for number in times.order:
-        message = survey.messages["force"][number]
-        force, torque = (
-            (float(each.x), float(each.y), float(each.z)) for each in (message.wrench.force, message.wrench.torque)
+        message, time = survey.messages["force"][number], times.stamps[number]
+        force, torque = (np.array([each.x, each.y, each.z]) for each in (message.wrench.force, message.wrench.torque))
+        if not np.isfinite([force, torque]).all():
+            continue
+        frame = frame_name(message.header.frame_id) or world
+        try:
+            rotation = survey.tree.T_world(frame, world, time, times.topic)[:3, :3]
+        except RecordingError:
+            rotation, apart[frame] = np.eye(3), apart[frame] + 1
+        else:
+            frame = WORLD
+        x, y, z = (rotation @ force).tolist()
+        u, v, w = (rotation @ torque).tolist()
+        found.append(ToolForce(time=time, force=(x, y, z), torque=(u, v, w), frame_id=frame, sd=sd))
+    for frame, count in apart.items():
+        notes.append(
+            f"{times.topic}: {count} forces are not used: /tf does not join '{frame}' to '{world}' at their time"
         )
-        if np.isfinite([*force, *torque]).all():
-            found.append(
-                ToolForce(time=times.stamps[number], force=force, torque=torque, frame_id=message.header.frame_id)
-            )
     return found

@@ -75,6 +75,8 @@ class BagSettings:
     """Field of the clouds that numbers the material points; empty for none, None to look for a usual name."""
     noise_sd: float | None = None
     """Standard deviation of each coordinate of the clouds [m]; None for the default of `MeasuredPoints`."""
+    force_sd: float | None = None
+    """Standard deviation of each component of the force on the tool [N]; None to measure it while the jaws are open."""
     allow_truncated: bool = False
     """Whether the complete records of an MCAP file that was cut off are read."""
     depth: DepthSettings = DepthSettings()
@@ -97,7 +99,7 @@ def read_map(path: Path) -> BagSettings:
         raise RecordingError(f"{path} is not TOML: {str(failure)[:200]}.") from failure
     tables = {
         name: top.table(name, optional=True)
-        for name in ("topics", "tool", "gripper", "camera", "time", "frames", "points", "depth", "declaration")
+        for name in ("topics", "tool", "gripper", "camera", "time", "frames", "points", "force", "depth", "declaration")
     }
     topics, gripper, camera, depth = tables["topics"], tables["gripper"], tables["camera"], tables["depth"]
     rule, limits = gripper.take("closed", kinds.text, None), depth.take("range", _range, [0.0, DepthSettings.far])
@@ -116,6 +118,7 @@ def read_map(path: Path) -> BagSettings:
         world=tables["frames"].take("world", kinds.text, None),
         id_field=tables["points"].take("id", kinds.text, None),
         noise_sd=tables["points"].take("noise_sd", kinds.positive, None),
+        force_sd=tables["force"].take("sd", kinds.positive, None),
         depth=DepthSettings(
             near=limits[0],
             far=limits[1],

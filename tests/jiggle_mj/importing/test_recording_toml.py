@@ -26,7 +26,7 @@ from tests.support.measured_folder import TOML, bring_in, folder
         (
             'name = "grid"',
             'name = "grid"\nunits = "mm"',
-            r"unknown key 'units'; did you mean 'unit'\? Known: declaration, frame, grasp",
+            r"unknown key 'units'; did you mean 'unit'\? Known: declaration, force, frame, grasp",
         ),
         (
             "rows = [0, 1]",

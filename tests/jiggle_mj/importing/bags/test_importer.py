@@ -305,13 +305,22 @@ def test_clocks_that_do_not_overlap_are_refused_with_both_spans(tmp_path: Path):
     assert "/tool/pose (1731800000.000 to" in why and "do not overlap in time" in why
 
 
-def test_a_measured_force_is_kept(tmp_path: Path):
+def test_a_measured_force_is_turned_to_the_world(tmp_path: Path):
+    """By a quarter turn about z, (x, y) becomes (-y, x); a force in a frame that /tf does not know is not used."""
+
     def force(made: RobotBag) -> None:
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+        made.tf("/tf_static", 0, made.transform("world", "sensor", 0, T))
         for index in range(7):
             made.wrench("/tool/wrench", index * STEP // 2, [index, 0, 0.5])
 
     _, recording = imported(bag(tmp_path, cameras, write_tool, write_images, force))
-    assert recording.ignored == {"/tool/force": 7}
+    forces = [each.force for each in recording]
+    assert recording.ignored == {} and all(each is not None for each in forces)
+    np.testing.assert_allclose(
+        [each.on_tool for each in forces], [[0, 2 * k, 0.5] for k in range(len(forces))], atol=1e-9
+    )
 
 
 def test_without_tf_the_camera_is_the_world_and_gravity_unknown(tmp_path: Path):
