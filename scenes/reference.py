@@ -145,6 +145,7 @@ class Reference:
             images=images,
             points=points,
             events=events,
+            force=self.observer.force(),
         )
 
     def truth_frame(self) -> TruthFrame:

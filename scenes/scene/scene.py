@@ -198,6 +198,8 @@ class SensingConfig(Section):
     """Number of points in each frame with `--sensing cloud`."""
     image_sd: float = number(2.0, unit="grey levels", at_least=0, at_most=100)
     """Standard deviation of the noise of each pixel [grey levels]."""
+    force_sd: float = number(0.0, unit="N", at_least=0, at_most=10)
+    """Standard deviation of the noise of each component of the force on the tool [N]; 0: no force is measured."""
 
 
 @dataclass(frozen=True, kw_only=True)

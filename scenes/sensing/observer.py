@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jiggle_mj.errors import SceneError
-from jiggle_mj.observation import MeasuredPoints, StereoPair, ToolReport
+from jiggle_mj.observation import MeasuredForce, MeasuredPoints, StereoPair, ToolReport
 from jiggle_mj.options import Sensing
 
 from ..scene.disturbance import SensingDisturbance
@@ -146,6 +146,14 @@ class Observer:
         now = round(self.simulation.data.time * 1e9)
         reports, self._reports = tuple(report for report in self._reports if report.time < now), []
         return reports
+
+    def force(self) -> MeasuredForce | None:
+        """Return the force on the tool as its sensor measures it; None where the scene has no sensor."""
+        sd = self.simulation.scene.sensing.force_sd
+        if not sd:
+            return None
+        on_tool = -self.simulation.jaws.pull.sum(axis=0)
+        return MeasuredForce(on_tool=on_tool + sd * self._rng.standard_normal(3), sd=sd)
 
     def _report(self) -> None:
         now = self.simulation.data.time

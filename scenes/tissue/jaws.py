@@ -59,9 +59,14 @@ class Jaws:
         self._data.eq_active[self._tissue.grips] = 0
         self._set_angle(OPEN_ANGLE)
 
+    @property
+    def pull(self) -> Float[np.ndarray, "n 3"]:
+        """Return the force of the jaws on each vertex [N]."""
+        return constraint_force(self._data, self._tissue.grips)
+
     def force(self) -> Float[np.ndarray, " n"]:
-        """Return the grip force on each vertex [N]."""
-        return np.linalg.norm(constraint_force(self._data, self._tissue.grips), axis=1)
+        """Return the size of the grip force on each vertex [N]."""
+        return np.linalg.norm(self.pull, axis=1)
 
     def slip(self) -> None:
         """Release the vertices whose grip force exceeds `slips_at`."""
