@@ -17,7 +17,7 @@ from jiggle_mj.actions import Cut, Suture
 from jiggle_mj.argument_checks import as_array, as_instance
 from jiggle_mj.camera import StereoCamera
 from jiggle_mj.errors import ObservationError, PerceptionError
-from jiggle_mj.estimate import Belief, Detection, Estimate, KeptFrames, PointNoise, Sheet
+from jiggle_mj.estimate import Belief, Detection, Estimate, ForceCheck, KeptFrames, PointNoise, Sheet
 from jiggle_mj.material import Material, check_ratios
 from jiggle_mj.observation import Declaration, Observation, ToolState
 
@@ -29,6 +29,7 @@ from .config import EstimatorConfig
 from .filters.force_balance import ForceBalance
 from .filters.kept_frames import kept_frames
 from .filters.posterior_summary import Convergence
+from .force_sensor import ForceSensor
 from .fusion import fill_unseen, fuse, pull
 from .grip import GripHold, GripTracker
 from .identifying import OnPass, identify_tracked
@@ -76,7 +77,7 @@ class Estimator:
         self._open_frame: Observation | None = None
         self._tool: ToolState | None = None
         self._seen_precision = np.eye(3) * INITIAL_POINT_SD**-2
-        self._grip, self._slip, self._has_estimate = GripTracker(), 0.0, False
+        self._grip, self._force, self._slip, self._has_estimate = GripTracker(), ForceSensor(), 0.0, False
 
     def update(self, observation: Observation) -> Estimate | None:
         """Take one observation; return None if it only helps to fix the rest shape, or cannot be used.
@@ -102,6 +103,7 @@ class Estimator:
     def _update(self, observation: Observation) -> Estimate | None:
         """Prepare the grasp of a frame, then run it through perception, grip, fusion and filter."""
         tool = self._tool = observation.tool
+        force = self._force.look(observation)
         if self._tracked_or_none is None:
             if (passed_over := self._perception.look_at_rest(observation)) is not None:
                 self.skipped.append((observation.index, passed_over))
@@ -125,7 +127,7 @@ class Estimator:
             self.skipped.append((observation.index, "no particle was seen"))
             return None
         hold, before = self._grasp(track, tool)
-        frame = fuse(track, hold, tool, before, grip_sd=self.config.grip_sd, field=tracked.field)
+        frame = fuse(track, hold, tool, before, grip_sd=self.config.grip_sd, field=tracked.field, force=force)
         state, update = tracked.filter.update(tracked.state, frame.evidence, jnp.asarray(frame.start))
         if not update.explains_the_frame:
             raise PerceptionError(f"observation {observation.index} leaves no finite state: no sheet explains it.")
@@ -135,22 +137,15 @@ class Estimator:
         self._seen_precision = track.white_precision[track.visible].mean(axis=0)
         if self.config.refinement == "frames":
             tracked.state = tracked.filter.resample(tracked.state)
-        summary, b = tracked.state.summary, np.asarray(tracked.state.summary.b)
-        return Estimate(
-            index=observation.index,
-            time=observation.time,
-            positions=tracked.x,
+        return summaries.estimate(
+            observation,
+            tracked.state.summary,
+            update,
+            scale=tracked.stiffness_scale,
+            rest=self.sheet.rest,
             observed=track.positions,
-            mean=b,
-            sd=np.asarray(summary.sd),
-            probability=np.asarray(summary.probability),
             held=hold.held,
-            entropy=float(summary.entropy),
-            nis=float(update.nis),
-            boundary_energy=0.5 * float(np.mean(b * np.sum((tracked.x - self.sheet.rest) ** 2, axis=1))),
-            update_s=time.perf_counter() - seen,
-            perception_s=seen - began,
-            converged=update.reason is not Convergence.SEARCH_CUT_OFF,
+            seconds=(time.perf_counter() - seen, seen - began),
         )
 
     def begin(self) -> Sheet:
@@ -204,7 +199,7 @@ class Estimator:
             ValueError: asked before `begin` and before the first frame with closed jaws.
         """
         with jax.enable_x64(True), one_thread():
-            return summaries.belief(self._tracked.state.summary)
+            return summaries.belief(self._tracked.state.summary, self._tracked.stiffness_scale)
 
     @property
     def detection(self) -> Detection:
@@ -218,6 +213,7 @@ class Estimator:
             tracked.state.summary,
             self.declaration,
             self.config,
+            scale=tracked.stiffness_scale,
             noise=tracked.filter.noise(tracked.state),
             refined=Convergence(int(tracked.state.release_convergence)),
         )
@@ -226,6 +222,12 @@ class Estimator:
     def kept_frames(self) -> KeptFrames | None:
         """What `identify_kept` needs of the frames so far; None where it cannot be kept (`filters.kept_frames`)."""
         return kept_frames(self._tracked.state)
+
+    @property
+    def force_check(self) -> ForceCheck | None:
+        """Measured and predicted force on the tool, as of the last release; None without a measured force."""
+        tracked = self._tracked
+        return summaries.force_check(tracked.filter.force(tracked.state), tracked.stiffness_scale)
 
     @property
     def prior_entropy(self) -> float:
@@ -258,9 +260,8 @@ class Estimator:
         Raises:
             ValueError: asked before `begin`, or of another filter than 'implicit'.
         """
-        tracked = self._tracked
         with jax.enable_x64(True):
-            return tracked.filter.by_forces("predicts pulls").balance(tracked.state)
+            return self._tracked.filter.by_forces("predicts pulls").balance(self._tracked.state)
 
     @property
     def attachment_belief(self) -> AttachmentBelief:
@@ -367,8 +368,7 @@ class Estimator:
             return
         thorough = at_the_end or self.config.refinement == "grasps"
         with jax.enable_x64(True), one_thread():
-            tracked.state, summary = tracked.filter.release(tracked.state, thorough=thorough)
-            summaries.refuse_not_finite(summary)
+            tracked.take(*tracked.filter.release(tracked.state, thorough=thorough))
 
     def _see(self, observation: Observation) -> Track:
         simulated = None if self._tracked.filter.matches_clouds else lambda: self._prediction(observation.tool)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jiggle_mj.observation import ToolState
 
-from .filters.evidence import Evidence, Pull
+from .filters.evidence import Evidence, MeasuredPull, Pull
 from .grip import GripHold
 from .perception.mesh_field import MeshField
 from .perception.track import Track
@@ -40,6 +40,7 @@ def fuse(
     *,
     grip_sd: float,
     field: MeshField,
+    force: MeasuredPull | None = None,
 ) -> FusedFrame:
     """Combine perception and grip by their precisions.
 
@@ -50,6 +51,7 @@ def fuse(
         before: the state of the frame before, or at rest where the jaws have just closed [m].
         grip_sd: standard deviation of held particles from where the tip takes them [m].
         field: fills what is unknown from its surroundings.
+        force: of the tool; None where none is measured.
     """
     seen, held, expected = track.visible, hold.held, hold.expected(tool)
     distance = np.linalg.norm((track.positions - expected)[seen & held], axis=1)
@@ -76,6 +78,7 @@ def fuse(
         fields=track.fields,
         pull=pull(before, tool, hold),
         cloud=track.cloud,
+        force=force,
     )
     return FusedFrame(evidence=evidence, start=start, slip=float(np.median(distance)) if len(distance) else 0.0)
 

@@ -16,7 +16,6 @@ from .config import EstimatorConfig
 from .filters.implicit import ImplicitFilter
 from .filters.kept_frames import resumed
 from .identification import identify
-from .summaries import refuse_not_finite
 from .tracked_sheet import TrackedSheet
 
 OnPass = Callable[[dict[str, float]], None]
@@ -43,8 +42,7 @@ def identify_tracked(
         parameters=parameters,
         on_pass=on_pass,
     )
-    tracked.state = found.state
-    refuse_not_finite(found.summary)
+    tracked.take(found.state, found.summary)
     return material(declaration, found.factors, found.log_sd, found.trades_with, converged=found.converged)
 
 

@@ -12,11 +12,15 @@ from jiggle_mj.mesh_checks import check_unfolded
 from jiggle_mj.observation import Declaration
 from jiggle_mj.sheet_triangulation import SheetPlane
 
+from .belief.gaussian_belief import GaussianBelief
 from .config import EstimatorConfig, for_clouds
 from .filter_builder import build_filter
 from .filters.filter import Filter, FilterState
+from .filters.force_fit import StiffnessScale
+from .filters.posterior_summary import PosteriorSummary
 from .perception.mesh_field import MeshField
 from .physics.mesh import SheetMesh
+from .summaries import refuse_not_finite
 
 
 @dataclass(kw_only=True)
@@ -37,6 +41,8 @@ class TrackedSheet:
     """Positions after the latest frame with closed jaws, at first at rest [m]."""
     open_x: Float[np.ndarray, "n 3"]
     """Positions with open jaws when they were last asked for, at first at rest [m]."""
+    stiffness_scale: StiffnessScale | None = None
+    """The factor that the tool's force put on all stiffnesses at the last refinement; None for 1."""
 
     @classmethod
     def build(
@@ -65,6 +71,17 @@ class TrackedSheet:
         """The learned factor on the variance of positions [1]."""
         noise = self.filter.noise(self.state)
         return 1.0 if noise is None else noise.position
+
+    def take(self, state: FilterState, summary: PosteriorSummary | None) -> None:
+        """Take the state after a refinement, and the factor that the tool's force puts on all stiffnesses then.
+
+        Raises:
+            PerceptionError: the posterior of the refinement is not finite; the state keeps the belief of before.
+        """
+        self.state = state
+        fit, belief = self.filter.force(state), state.summary.belief
+        self.stiffness_scale = None if fit is None or isinstance(belief, GaussianBelief) else fit.scale(belief)
+        refuse_not_finite(summary)
 
 
 def unfolded(sheet: Sheet) -> tuple[SheetMesh, SheetPlane]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from .actions import Action
 from .errors import ActionError, OutputError, PerceptionError
-from .estimate import Belief, Detection, Estimate, PointNoise, Sheet
+from .estimate import Belief, Detection, Estimate, ForceCheck, PointNoise, Sheet
 from .observation import Observation
 from .recording.declaration import identity
 from .recording.estimate import EstimateWriter
@@ -59,6 +59,8 @@ class Episode:
     """Index and reason of each frame that the recording or the estimator could not use."""
     point_noise: PointNoise | None = None
     """Noise of measured points that the estimator counted with; None for images."""
+    force: ForceCheck | None = None
+    """Measured and predicted force on the tool; None where none was measured."""
 
 
 class Stopwatch:
@@ -272,4 +274,5 @@ def estimate(
         n_frames=n_frames + len(unreadable),
         skipped=skipped,
         point_noise=estimator.point_noise,
+        force=estimator.force_check,
     )

@@ -42,6 +42,33 @@ class PointNoise:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ForceCheck:
+    """The force on the tool as it was measured, beside what the sheet's shape predicts."""
+
+    index: Int[np.ndarray, " t"]
+    """Index of the observation of each row."""
+    measured: Float[np.ndarray, "t 3"]
+    """Measured force on the tool in the world, less what the sensor shows with open jaws [N]."""
+    predicted: Float[np.ndarray, "t 3"]
+    """The same by the shape and the declared membrane stiffness, from no measured force [N]."""
+    sd: Float[np.ndarray, "t 3"]
+    """Standard deviation of their difference [N]."""
+    nis: float
+    """Normalised innovation squared per component, at the declared stiffness; 1 where all is right."""
+    scaled_nis: float
+    """The same at the factor on all stiffnesses that fits best; see stiffness_factor."""
+    used: bool
+    """Whether the force is part of the estimate."""
+    why_not: str | None
+    """Why it is not; None where it is."""
+    stiffness_factor: float | None
+    """True over declared membrane stiffness, by which every b is multiplied [1]; None where the force does not
+    determine it, and b is relative to the declared one."""
+    stiffness_factor_log_sd: float | None
+    """Standard deviation of its logarithm [nat]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Estimate:
     """The belief after one observation."""
 

@@ -77,7 +77,7 @@ def collect_dataset(
     resting: dict[int, list[MeasuredPoints]] = {}
     grasp, closed = -1, 0
     for observation in observations:
-        found = estimator.update(observation)
+        found = estimator.update(replace(observation, force=None))  # effects are of the declared stiffness
         on_frame(observation, found)
         if observation.points is not None:
             noise = stated(observation.points)

@@ -30,6 +30,10 @@ class FilterConfig:
     """Change of some s since a grasp was linearised from which it is linearised again [1]."""
     relinearise_for_noise_beyond: float = 3e-3
     """The same before the noise is learned from a grasp's residuals [1]: the s of the softest attachment."""
+    declared_stiffness_sd: float = 0.5
+    """Standard deviation of the logarithm of the true over the declared membrane stiffness [nat]; it counts where the
+    tool's force is measured. With a small one, such as 0.02 for a measured stiffness, the force says more about the
+    single attachments."""
     max_passes: int = 3
     """Most passes over grasps to be linearised again, and over noises, when the jaws open."""
     change_sweeps: int = 10

@@ -23,6 +23,17 @@ class Pull(eqx.Module):
     """Distance of each particle from the tip when the jaws closed [m]."""
 
 
+class MeasuredPull(eqx.Module):
+    """The force of the tool on the tissue, as it was measured in a frame."""
+
+    index: Int[Array, ""]
+    """Index of the observation."""
+    pull: Float[Array, " 3"]
+    """The force in the world [N]: minus that on the tool."""
+    covariance: Float[Array, "3 3"]
+    """Covariance of its noise [N^2]."""
+
+
 class Evidence(eqx.Module):
     """One frame's measurements of the particles."""
 
@@ -42,6 +53,8 @@ class Evidence(eqx.Module):
     cloud: Cloud | None = None
     """A cloud without identities, whose observations depend on the state: see `near`. Position and precision are then
     what is known without it. None where the particles are identified."""
+    force: MeasuredPull | None = None
+    """The tool's force; None where it was not measured, and for the prediction of a pull."""
 
     def near(self, x: Float[Array, "n 3"], *, gate: float = 0.0) -> "Evidence":
         """Return the evidence with a cloud matched to the surface at a state; see `Cloud.matched` for the gate."""

@@ -19,6 +19,7 @@ from ..belief.topology import Change, meant_by
 from ..physics.energy import SheetEnergy
 from .evidence import Evidence
 from .force_balance import ForceBalance
+from .force_fit import ForceFit
 from .noise import Noise
 from .posterior_summary import PosteriorSummary, Update, prior_summary
 
@@ -108,6 +109,10 @@ class Filter(eqx.Module, Generic[State]):
             that is not finite is returned, but the state keeps the one before.
         """
         return state, None
+
+    def force(self, state: State) -> ForceFit | None:
+        """Return the measured forces of the tool beside the predicted ones; None where none is measured or used."""
+        return None
 
     def by_forces(self, purpose: str) -> "ForceBalanceFilter[Any]":
         """Return this filter as one that linearises the balance of forces.

@@ -9,6 +9,7 @@ from .evidence import Evidence
 from .force_balance import ForceBalance
 from .frame import FrameInformation
 from .noise import ForceResiduals, Noise
+from .tool_force import FrameForce, frame_force
 
 
 class GraspFrame(eqx.Module):
@@ -36,11 +37,13 @@ class GraspFrames(eqx.Module):
     time, and after the sheet's energy has changed."""
     residuals: ForceResiduals | None
     """Sum of the frames' residuals; None where they were not linearised again."""
+    forces: tuple[FrameForce, ...]
+    """What the tool's force says in the frames that have one, once they were linearised again."""
 
     @classmethod
     def empty(cls, n: int, noise: Noise | None = None) -> "GraspFrames":
         """Return a grasp of n particles without frames."""
-        return cls(frames=(), precision=jnp.zeros((n, n)), shift=jnp.zeros(n), noise=noise, residuals=None)
+        return cls(frames=(), precision=jnp.zeros((n, n)), shift=jnp.zeros(n), noise=noise, residuals=None, forces=())
 
     def with_frame(
         self,
@@ -48,6 +51,7 @@ class GraspFrames(eqx.Module):
         x: Float[Array, "n 3"],
         information: FrameInformation,
         residuals: ForceResiduals | None = None,
+        force: FrameForce | None = None,
     ) -> "GraspFrames":
         """Return the grasp with one frame more."""
         before = self.residuals
@@ -57,6 +61,7 @@ class GraspFrames(eqx.Module):
             shift=self.shift + information.shift,
             noise=self.noise,
             residuals=residuals if before is None or residuals is None else before + residuals,
+            forces=self.forces if force is None else (*self.forces, force),
         )
 
     def distance(self, s: Float[Array, " n"]) -> float:
@@ -67,13 +72,14 @@ class GraspFrames(eqx.Module):
         """Return the same frames linearised at s with the given noise, each searched from the state found before."""
         grasp, balance = GraspFrames.empty(len(s), noise), balance.inflated(noise.force)
 
-        def relinearise(k: int) -> tuple[Float[Array, "n 3"], FrameInformation, ForceResiduals]:
+        def relinearise(k: int) -> tuple[Float[Array, "n 3"], FrameInformation, ForceResiduals, FrameForce | None]:
             evidence = self.frames[k].evidence.inflated(noise.position)
             frame, fit, information = balance.evidence_near(self.frames[k].x, s, evidence)
-            return frame.x, information, _residuals(balance, frame, fit)
+            force = None if evidence.force is None else frame_force(balance, frame, fit)
+            return frame.x, information, _residuals(balance, frame, fit), force
 
-        for k, (x, information, residuals) in parallel_map(relinearise, range(len(self.frames))).items():
-            grasp = grasp.with_frame(self.frames[k].evidence, x, information, residuals)
+        for k, (x, information, residuals, force) in parallel_map(relinearise, range(len(self.frames))).items():
+            grasp = grasp.with_frame(self.frames[k].evidence, x, information, residuals, force)
         return grasp
 
 

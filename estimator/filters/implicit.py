@@ -8,6 +8,7 @@ Nothing is counted twice.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -26,6 +27,7 @@ from .config import FilterConfig, SamplingConfig
 from .evidence import Evidence
 from .filter import FilterState, ForceBalanceFilter, Region
 from .force_balance import ForceBalance
+from .force_fit import ForceFit
 from .frame import Frame, FrameInformation
 from .grasp import GraspFrames
 from .noise import Noise
@@ -49,6 +51,8 @@ class ImplicitState(FilterState):
     """Whether the jaws have opened since the last frame."""
     thorough_due: bool
     """Whether the last release was not thorough."""
+    force: ForceFit | None
+    """The tool's force since the last cut or suture that has one; None before a release with one."""
 
     @property
     def belief(self) -> AttachmentBelief:
@@ -66,6 +70,11 @@ class ImplicitState(FilterState):
         for grasp in self.grasps[1:]:
             precision, shift = precision + grasp.precision, shift + grasp.shift
         return precision, shift
+
+    @property
+    def uses_force(self) -> bool:
+        """Whether the tool's force is part of the belief."""
+        return self.force is not None and self.force.evidence is not None
 
     @property
     def learned_noise(self) -> Noise:
@@ -111,6 +120,7 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
             earlier_shift=jnp.zeros(n),
             between_grasps=True,
             thorough_due=False,
+            force=None,
         )
 
     def update(
@@ -142,7 +152,8 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
         if thorough:
             return self._refined(state)
         summary = self._quick(state, state.belief)
-        return _with_release(*self._relinearised(state, summary, self.config.relinearise_beyond, 1))
+        found = self._relinearised(state, summary, self.config.relinearise_beyond, 1, forced=state.uses_force)
+        return _with_release(*self._forced(*found))
 
     def change(self, state: ImplicitState, event: Cut | Suture, *, region: Region, index: int) -> ImplicitState:
         """See `Filter.change`; the next frame begins another grasp, and no frame from before is linearised again."""
@@ -170,6 +181,10 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
     def noise(self, state: ImplicitState) -> Noise:
         """See `Filter.noise`."""
         return state.noise
+
+    def force(self, state: ImplicitState) -> ForceFit | None:
+        """See `Filter.force`."""
+        return state.force
 
     def balance(self, state: ImplicitState) -> ForceBalance:
         """See `ForceBalanceFilter.balance`."""
@@ -202,26 +217,41 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
 
     def _refined(self, state: ImplicitState) -> tuple[ImplicitState, PosteriorSummary]:
         """Linearise stale grasps again, learn the noise from their residuals, repeat; then draw many samples."""
-        config = self.config
+        config, forced = self.config, state.uses_force
         summary = self._quick(state, state.belief)
-        state, summary = self._relinearised(state, summary, config.relinearise_beyond, config.max_passes)
+        again = partial(self._relinearised, forced=forced)
+        state, summary = again(state, summary, config.relinearise_beyond, config.max_passes)
         for _ in range(config.max_passes):
             if not self.learns_noise or state.learned_noise is state.noise:
                 break
-            state, summary = self._relinearised(state, summary, config.relinearise_for_noise_beyond, 1)
+            state, summary = again(state, summary, config.relinearise_for_noise_beyond, 1)
             state = replace(state, noise=state.learned_noise)
-            state, summary = self._relinearised(state, summary, config.relinearise_beyond, config.max_passes)
+            state, summary = again(state, summary, config.relinearise_beyond, config.max_passes)
+        state, summary = self._forced(state, summary)
         belief = summary.belief
         assert isinstance(belief, AttachmentBelief)
         return _with_release(state, sampled(belief, state.key, self.sampling.thorough, self.sampling))
 
+    def _forced(self, state: ImplicitState, summary: PosteriorSummary) -> tuple[ImplicitState, PosteriorSummary]:
+        """Add the tool's force where it is new, once the shape is explained as well as it can be without it.
+
+        Before, a force of another sign or frame would not stand out, and the noise that is learned would cover it up.
+        """
+        if state.uses_force or not any(grasp.forces for grasp in state.grasps):
+            return state, summary
+        state, belief = self._with_force(state, self._total(state, summary))
+        if not state.uses_force:
+            return state, summary
+        summary, config = self._quick(state, belief), self.config
+        return self._relinearised(state, summary, config.relinearise_beyond, config.max_passes, forced=True)
+
     def _relinearised(
-        self, state: ImplicitState, summary: PosteriorSummary, beyond: float, passes: int
+        self, state: ImplicitState, summary: PosteriorSummary, beyond: float, passes: int, *, forced: bool
     ) -> tuple[ImplicitState, PosteriorSummary]:
         """Linearise stale grasps again, and draw a few samples after each pass.
 
         A grasp is stale if some s has moved by more than `beyond`, or the noise has changed, since its linearisation.
-        There are at most `passes` passes.
+        There are at most `passes` passes. Where `forced`, the tool's force is part of the evidence.
         """
         for _ in range(passes):
             belief = summary.belief
@@ -235,12 +265,29 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
                 for grasp, is_stale in zip(state.grasps, stale, strict=True)
             )
             state = replace(state, grasps=grasps)
-            evidence = state.evidence
-            assert evidence is not None
-            total = state.earlier_precision + evidence[0], state.earlier_shift + evidence[1]
-            belief = eqx.tree_at(lambda belief: (belief.precision, belief.shift), belief, total)
+            belief = self._total(state, summary)
+            if forced:
+                state, belief = self._with_force(state, belief)
             summary = self._quick(state, belief)
         return state, summary
+
+    def _total(self, state: ImplicitState, summary: PosteriorSummary) -> AttachmentBelief:
+        """Return the belief with the evidence of all frames, the tool's force left out."""
+        belief, evidence = summary.belief, state.evidence
+        assert isinstance(belief, AttachmentBelief) and evidence is not None
+        total = state.earlier_precision + evidence[0], state.earlier_shift + evidence[1]
+        return eqx.tree_at(lambda belief: (belief.precision, belief.shift), belief, total)
+
+    def _with_force(self, state: ImplicitState, belief: AttachmentBelief) -> tuple[ImplicitState, AttachmentBelief]:
+        """Add the evidence of the tool's force, if it can be that of the sheet, to a belief by all else."""
+        frames = [frame for grasp in state.grasps for frame in grasp.forces]
+        if not frames:
+            return state, belief
+        fit = ForceFit.of(frames, belief, sd=self.config.declared_stiffness_sd)
+        if fit.evidence is not None:
+            marginal = fit.evidence.marginal
+            belief = belief.add(jnp.asarray(marginal.precision), jnp.asarray(marginal.shift))
+        return replace(state, force=fit), belief
 
     def _quick(self, state: ImplicitState, belief: AttachmentBelief) -> PosteriorSummary:
         """Return the posterior by a few samples."""

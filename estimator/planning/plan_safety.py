@@ -81,7 +81,6 @@ def observed_energy_ratio(
         min_energy: a smaller predicted energy counts as this [J].
     """
     squared = jnp.sum((candidate.start[0] - predictor.balance.energy.rest) ** 2, axis=1)
-    b = predictor.balance.reference * s / (1 - s)
-    observed = 0.5 * jnp.median(b @ squared) / len(squared)
+    observed = 0.5 * jnp.median(predictor.stiffness(s) @ squared) / len(squared)
     predicted = jnp.median(outcomes(predictor, candidate, s, informative=False).energy)
     return max(1.0, float(observed / jnp.maximum(predicted, min_energy)))

@@ -99,6 +99,8 @@ class PullPredictor(eqx.Module):
     """Variance of each s under the belief's Gaussian."""
     shared_noise: Float[Array, "n modes"] | None
     """See `Evidence.fields`."""
+    stiffness_factor: Float[Array, ""]
+    """Factor on all forces and stiffnesses, which the tool's force shows; 1 where none is measured [1]."""
 
     @classmethod
     def build(
@@ -108,6 +110,8 @@ class PullPredictor(eqx.Module):
         point_precision: Float[Array, "3 3"],
         about: Bool[Array, " n"],
         shared_noise: Float[Array, "n modes"] | None = None,
+        *,
+        stiffness_factor: float = 1.0,
     ) -> "PullPredictor":
         """Return a predictor, with what does not depend on the pull computed once.
 
@@ -117,6 +121,7 @@ class PullPredictor(eqx.Module):
             point_precision: inverse covariance of an observed particle's position, without shared noise [1/m^2].
             about: particles whose s is asked about.
             shared_noise: see `Evidence.fields`.
+            stiffness_factor: factor on all forces and stiffnesses [1].
         """
         mixture, gaussian = _mixture_and_gaussian(belief)
         return cls(
@@ -127,6 +132,7 @@ class PullPredictor(eqx.Module):
             mixture=mixture,
             variance=gaussian.variance,
             shared_noise=shared_noise,
+            stiffness_factor=jnp.asarray(stiffness_factor, dtype=float),
         )
 
     @classmethod
@@ -144,7 +150,14 @@ class PullPredictor(eqx.Module):
         asked = jnp.ones(len(belief.shift), dtype=bool) if about is None else jnp.asarray(about)
         shared = estimator.shared_noise
         shared = None if shared is None else jnp.asarray(shared)
-        return cls.build(balance, belief, jnp.asarray(estimator.point_precision), asked, shared)
+        check = estimator.force_check
+        factor = 1.0 if check is None or check.stiffness_factor is None else check.stiffness_factor
+        precision = jnp.asarray(estimator.point_precision)
+        return cls.build(balance, belief, precision, asked, shared, stiffness_factor=factor)
+
+    def stiffness(self, s: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """Return b of bounded stiffnesses [N/m]."""
+        return self.stiffness_factor * self.balance.reference * s / (1 - s)
 
     def scenarios(self, key: PRNGKeyArray, count: int, *, unknown: float | Array) -> Float[Array, "count n"]:
         """Draw scenarios of s: first each particle's stiffness component by itself, then all s jointly given those.
@@ -156,7 +169,8 @@ class PullPredictor(eqx.Module):
         """
         belief, mixture = self.belief, self.mixture
         weight = mixture.weight
-        largest = jnp.maximum(belief.bounded(jnp.asarray(unknown)[None]), mixture.quantile(0.5))
+        unknown = jnp.asarray(unknown)[None] / self.stiffness_factor
+        largest = jnp.maximum(belief.bounded(unknown), mixture.quantile(0.5))
         prior = belief.prior.stiffness
         by_state, by_noise = jax.random.split(key)
         log_weight = jnp.log(jnp.maximum(weight, MIN_WEIGHT))[None]
@@ -204,7 +218,7 @@ class PullPredictor(eqx.Module):
             s,
             self._evidence(candidate, candidate.to),
         )
-        b, squared = balance.reference * s / (1 - s), jnp.sum((x - balance.energy.rest) ** 2, axis=1)
+        b, squared = self.stiffness(s), jnp.sum((x - balance.energy.rest) ** 2, axis=1)
         force = jnp.max(b * jnp.sqrt(squared))
         return Outcome(x=x, gain=jnp.zeros(()), energy=0.5 * b @ squared / len(s), force=force)
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool
 from jiggle_mj.argument_checks import as_path
 from jiggle_mj.episode import Episode
 from jiggle_mj.errors import RecordingError
-from jiggle_mj.estimate import Belief, Detection, Estimate, PointNoise, Sheet
+from jiggle_mj.estimate import Belief, Detection, Estimate, ForceCheck, PointNoise, Sheet
 from jiggle_mj.limits import Limits
 from jiggle_mj.recording.estimate import EstimateRecording
 from jiggle_mj.truth import Truth
@@ -98,6 +98,7 @@ def result(run: Run) -> Json:
             "position_sd_ratio": detection.position_sd_ratio,
             "points": _point_noise(episode.point_noise),
         },
+        "force": _force(episode.force),
         "calibration": dict.fromkeys(field.name for field in fields(Calibration)),
         "tracking": {"rms_m": None},
         "safety": {
@@ -222,6 +223,29 @@ def _point_noise(noise: PointNoise | None) -> Json | None:
         "smooth_length_m": noise.smooth_length,
         "stated_sd_m": noise.stated_sd,
         "still_frames": noise.still_frames,
+    }
+
+
+def _force(check: ForceCheck | None) -> Json | None:
+    """Return the measured and predicted forces on the tool; None where none was measured."""
+    if check is None:
+        return None
+    return {
+        "used": check.used,
+        "why_not": check.why_not,
+        "nis": _finite(check.nis),
+        "scaled_nis": _finite(check.scaled_nis),
+        "stiffness_factor": check.stiffness_factor,
+        "stiffness_factor_log_sd": check.stiffness_factor_log_sd,
+        "frames": [
+            {
+                "index": int(index),
+                "measured_n": check.measured[row].tolist(),
+                "predicted_n": check.predicted[row].tolist(),
+                "sd_n": check.sd[row].tolist(),
+            }
+            for row, index in enumerate(check.index)
+        ],
     }
 
 

@@ -14,6 +14,12 @@ from ..metrics.truth_transfer import TransferredTruth
 
 MAX_SD_RATIO = 1.5
 """Largest ratio of the found to the assumed standard deviation of a noise that is no doubt yet."""
+MAX_FORCE_NIS = 3.0
+"""Largest normalised innovation squared of the measured force that is no doubt yet [1]."""
+SURE_FACTOR = 2.0
+"""Logarithm of the stiffness factor from which the declared stiffness is doubted [standard deviation]."""
+MIN_FACTOR = 1.15
+"""Stiffness factor, or one over it, below which it is no doubt [1]: the model and its bed are not better than that."""
 LISTED_PATCHES = 3
 """Patches whose place is given; the others are counted."""
 
@@ -84,6 +90,28 @@ def doubts(figures: Mapping[str, Any]) -> list[str]:
                 f"Frames at rest show a noise of {1e3 * measured:.2g} mm where the recording states "
                 f"{1e3 * stated:.2g} mm; the larger one counted."
             )
+    return [*sentences, *_force_doubts(figures.get("force"))]
+
+
+def _force_doubts(force: Mapping[str, Any] | None) -> list[str]:
+    """Return what the measured force says against itself, the declared stiffness or the model."""
+    if force is None:
+        return []
+    if not force["used"]:
+        return [f"The force on the tool is not used: {force['why_not']}"]
+    sentences = []
+    if (factor := force["stiffness_factor"]) is not None:
+        log_sd = force["stiffness_factor_log_sd"]
+        if abs(np.log(factor)) > max(SURE_FACTOR * log_sd, np.log(MIN_FACTOR)):
+            sentences.append(
+                f"By the force on the tool the sheet is {factor:.2f} times as stiff as declared, to {log_sd:.0%}; "
+                "every b has that factor. Declare that membrane_stiffness, or see whether the force is right."
+            )
+    if (nis := force["scaled_nis"]) is not None and nis > MAX_FORCE_NIS:
+        sentences.append(
+            f"The force on the tool differs from the predicted one by {nis**0.5:.1f} times its standard deviation, at "
+            "any stiffness of the sheet: something pulls that the model lacks, or the sensor's offset or axes are off."
+        )
     return sentences
 
 

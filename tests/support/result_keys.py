@@ -17,6 +17,7 @@ KEYS = {
         "estimator": {},
     },
     "noise": dict.fromkeys(("force_sd_ratio", "position_sd_ratio", "points")),
+    "force": None,
     "calibration": dict.fromkeys(("nees_per_dof", "nees_attached", "coverage_90", "coverage_attached", "ece")),
     "tracking": {"rms_m": None},
     "safety": dict.fromkeys(

@@ -191,3 +191,13 @@ def test_the_predicted_gain_counts_noise_that_neighbours_share(predictor):
 
     assert float(counted.gain_at(pull, s, x)) == pytest.approx(gain(seen), rel=ROUNDING)
     assert gain(seen) > gain(seen.without_fields())
+
+
+def test_loads_are_those_of_the_sheet_that_the_force_of_the_tool_shows(predictor):
+    """With a factor on all stiffnesses nothing moves otherwise, and energies and forces have it."""
+    twice = eqx.tree_at(lambda p: p.stiffness_factor, predictor, jnp.asarray(2.0))
+    s = jnp.where(attached(), KNOWN, 0.0)
+    declared, found = (each.outcome(lift(6e-3), s, informative=False) for each in (predictor, twice))
+    np.testing.assert_array_equal(declared.x, found.x)
+    assert found.force == pytest.approx(2 * float(declared.force), rel=ROUNDING)
+    assert found.energy == pytest.approx(2 * float(declared.energy), rel=ROUNDING)

@@ -233,6 +233,25 @@ def test_the_page_says_how_a_policy_ended_with_its_acts_and_draws_the_path_of_th
     assert np.allclose([axis[0] for axis in payload["paths"][0]["xyz"]], held, atol=PAGE_ROUNDING_MM)
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, None),
+        ({"stiffness_factor": 1.1}, None),
+        ({"stiffness_factor": 2.1}, "2.10 times as stiff as declared, to 3%"),
+        ({"stiffness_factor": 2.1, "stiffness_factor_log_sd": 0.5}, None),
+        ({"stiffness_factor": None, "stiffness_factor_log_sd": None}, None),
+        ({"scaled_nis": 16.0}, "by 4.0 times its standard deviation"),
+        ({"used": False, "why_not": "its sign."}, "The force on the tool is not used: its sign."),
+    ],
+)
+def test_what_the_force_says_against_the_declaration_or_itself_is_shown(changes, words):
+    good = {"used": True, "why_not": None, "nis": 1.0, "scaled_nis": 1.0, "stiffness_factor": 1.0}
+    force = good | {"stiffness_factor_log_sd": 0.03} | changes
+    found = doubts({"detection": {}, "force": force})
+    assert found == [] if words is None else words in found[0] and len(found) == 1
+
+
 def test_doubts_are_listed_where_there_are_any(tmp_path):
     good = {"detection": {"converged": True}, "noise": {"force_sd_ratio": 1.4, "position_sd_ratio": None}}
     bad = {"detection": {"converged": False}, "noise": {"force_sd_ratio": 12.04, "position_sd_ratio": 1.2}}

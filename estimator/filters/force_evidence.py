@@ -1,0 +1,158 @@
+"""The tool's force in all frames: the stiffnesses in N/m, and how far the declared membrane stiffness is off.
+
+Positions give stiffnesses relative to the declared membrane stiffness. Where that is off by a factor c, so are all
+elastic forces and every b. With `FrameForce` for the other symbols,
+
+    L = P - loads = c E(s) + n,    n ~ N(0, V_L + c^2 V),    log c ~ N(0, sd^2).
+
+E is the expected force given what was seen, so its error does not bias c, which that of L as a regressor would [Berkson
+1950, doi:10.1080/01621459.1950.10483349]. Linearised at s and log c, frames add up in information form over both.
+Log c is marginalised for the belief over s; given s it is normal.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ..belief.gaussian_information import GaussianInformation
+from .tool_force import FrameForce
+
+STEPS = 8
+"""Gauss-Newton steps of log c and s; from off by ten it takes five."""
+MAX_STEP = 1.0
+"""Longest step of log c [nat]."""
+MAX_LOG_FACTOR = 5.0
+"""Largest size of log c [nat]: a factor of 150, where `force_axes` doubts the unit long before."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackedForces:
+    """The forces of several frames."""
+
+    dE_ds: Float[np.ndarray, "t 3 n"]
+    """Derivative of E by s [N]."""
+    offset: Float[np.ndarray, "t 3"]
+    """Value of E at s = 0 [N]."""
+    pull: Float[np.ndarray, "t 3"]
+    """Measured force of the tool on the tissue [N]."""
+    loads: Float[np.ndarray, "t 3"]
+    """The part of it that lifts the weight and presses on the bed [N]."""
+    model_covariance: Float[np.ndarray, "t 3 3"]
+    """Covariance of E given s [N^2]."""
+    load_covariance: Float[np.ndarray, "t 3 3"]
+    """Covariance of L [N^2]."""
+
+    @classmethod
+    def of(cls, frames: Sequence[FrameForce]) -> "StackedForces":
+        """Stack frames, at least one."""
+        columns = ("dE_ds", "pull", "loads", "model_covariance", "load_covariance")
+        return cls(
+            offset=np.array([frame.elastic - frame.dE_ds @ frame.at for frame in frames]),
+            **{name: np.array([getattr(frame, name) for frame in frames]) for name in columns},
+        )
+
+    def elastic(self, s: Float[np.ndarray, " n"]) -> Float[np.ndarray, "t 3"]:
+        """Return E(s) [N]."""
+        return self.offset + self.dE_ds @ s
+
+    def covariance(self, factor: float) -> Float[np.ndarray, "t 3 3"]:
+        """Return the covariance of n for a factor c [N^2]."""
+        return self.load_covariance + factor**2 * self.model_covariance
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceEvidence:
+    """Evidence about (s, log c) in information form."""
+
+    precision: Float[np.ndarray, "n n"]
+    """Precision of s."""
+    cross: Float[np.ndarray, " n"]
+    """Precision between s and log c."""
+    own: float
+    """Precision of log c, with its prior."""
+    shift: Float[np.ndarray, " n"]
+    """Information vector of s."""
+    own_shift: float
+    """Information of log c."""
+
+    @classmethod
+    def of(cls, forces: StackedForces, s: Float[np.ndarray, " n"], log_factor: float, *, sd: float) -> "ForceEvidence":
+        """Linearise the forces at s and log c.
+
+        Args:
+            forces: of all frames.
+            s: bounded stiffnesses [1].
+            log_factor: log c [nat].
+            sd: standard deviation of log c before any force [nat].
+        """
+        factor = np.exp(log_factor)
+        root = np.linalg.inv(np.linalg.cholesky(forces.covariance(factor)))
+        elastic = factor * forces.elastic(s)
+        J = (root @ (factor * forces.dE_ds)).reshape(-1, len(s))
+        by_log, residual = (
+            (root @ part[..., None]).reshape(-1) for part in (elastic, forces.pull - forces.loads - elastic)
+        )
+        target = residual + J @ s + by_log * log_factor
+        return cls(
+            precision=J.T @ J,
+            cross=J.T @ by_log,
+            own=float(by_log @ by_log) + sd**-2,
+            shift=J.T @ target,
+            own_shift=float(by_log @ target),
+        )
+
+    @property
+    def marginal(self) -> GaussianInformation:
+        """Evidence about s alone."""
+        return GaussianInformation(
+            precision=self.precision - np.outer(self.cross, self.cross) / self.own,
+            shift=self.shift - self.cross * self.own_shift / self.own,
+        )
+
+    def given(
+        self, mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]
+    ) -> tuple[float, float, Float[np.ndarray, " n"]]:
+        """Return mean and standard deviation of log c and its covariance with s, for a posterior that holds this."""
+        slope = -self.cross / self.own
+        with_s = covariance @ slope
+        return float(self.own_shift / self.own + slope @ mean), float((1 / self.own + slope @ with_s) ** 0.5), with_s
+
+
+def fitted(
+    forces: StackedForces, precision: Float[np.ndarray, "n n"], shift: Float[np.ndarray, " n"], *, sd: float
+) -> tuple[ForceEvidence, float]:
+    """Return the evidence of forces, linearised where it and all else agree best, and log c there.
+
+    Args:
+        forces: of all frames.
+        precision: precision of s by all else.
+        shift: information vector of s by all else.
+        sd: standard deviation of log c before any force [nat].
+    """
+    s, log_factor = np.linalg.solve(precision, shift), 0.0
+    evidence = ForceEvidence.of(forces, s, log_factor, sd=sd)
+    for _ in range(STEPS):
+        marginal = evidence.marginal
+        s = np.linalg.solve(precision + marginal.precision, shift + marginal.shift)
+        found = (evidence.own_shift - evidence.cross @ s) / evidence.own
+        step = np.clip(found - log_factor, -MAX_STEP, MAX_STEP)
+        log_factor = float(np.clip(log_factor + step, -MAX_LOG_FACTOR, MAX_LOG_FACTOR))
+        evidence = ForceEvidence.of(forces, s, log_factor, sd=sd)
+    return evidence, log_factor
+
+
+def innovations(
+    forces: StackedForces, mean: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"], *, factor: float
+) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t 3 3"]]:
+    """Return the measured less the predicted forces of frames on the tissue [N], and their covariances [N^2].
+
+    Args:
+        forces: of all frames.
+        mean: mean of s.
+        covariance: covariance of s.
+        factor: c [1].
+    """
+    spread = factor**2 * forces.dE_ds @ covariance @ np.swapaxes(forces.dE_ds, 1, 2)
+    return forces.pull - forces.loads - factor * forces.elastic(mean), forces.covariance(factor) + spread

@@ -1,0 +1,43 @@
+"""The offset of a force sensor is what it shows with open jaws, and its noise what scatters there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator.force_sensor import MIN_OPEN, ForceSensor
+from jiggle_mj.observation import MeasuredForce, Observation
+from tests.support.recordings import tool
+
+OFFSET, SD = np.array([0.3, -0.1, -0.7]), 0.02
+
+
+def observation(index: int, *, closed: bool, on_tool: np.ndarray, sd: float | None = None) -> Observation:
+    force = MeasuredForce(on_tool=on_tool, sd=sd)
+    return Observation(index=index, time=index, tool=replace(tool(), closed=closed), force=force)
+
+
+def readings(count: int, sd: float | None = None):
+    """Return what a sensor makes of a force (0, 0, -1) after some frames with open jaws."""
+    sensor, rng = ForceSensor(), np.random.default_rng(0)
+    for index in range(count):
+        noisy = OFFSET + SD * rng.normal(size=3)
+        assert sensor.look(observation(index, closed=False, on_tool=noisy, sd=sd)) is None
+    return sensor.look(observation(count, closed=True, on_tool=OFFSET - np.array([0, 0, 1.0]), sd=sd))
+
+
+def test_offset_and_noise_are_those_with_open_jaws():
+    """Tolerances: three standard errors of a mean, and of a standard deviation, of 50 frames."""
+    force = readings(50)
+    assert force is not None and int(force.index) == 50
+    np.testing.assert_allclose(force.pull, [0, 0, 1], atol=3 * SD / 50**0.5)
+    found = np.sqrt(np.diagonal(force.covariance))
+    np.testing.assert_allclose(found, SD, rtol=3 / (2 * 150) ** 0.5 + 0.01)
+
+
+def test_a_stated_noise_counts_and_too_few_frames_say_nothing():
+    stated = readings(2, sd=0.5)
+    assert stated is not None
+    assert np.asarray(stated.covariance)[0, 0] == pytest.approx(0.25 * 1.5)
+    unknown = readings(MIN_OPEN - 1)
+    assert unknown is not None and np.isnan(np.asarray(unknown.covariance)).any()
