@@ -23,7 +23,7 @@ def parallel_map(function: Callable[[int], T], keys: Iterable[int]) -> dict[int,
     Every thread uses the caller's `jax_enable_x64` and `jax_default_device`. An exception of any call is raised here.
     """
     keys = list(keys)
-    x64, device = jax.config.read("jax_enable_x64"), jax.config.jax_default_device
+    x64, device = jax.config.read("jax_enable_x64"), jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
     def call(key: int) -> T:
         with jax.enable_x64(x64), jax.default_device(device):  # settings of each thread

@@ -163,7 +163,7 @@ class Sampler(eqx.Module):
             arguments = jax.random.fold_in(key, part), jnp.asarray(0 if part else burn_in), jnp.asarray(sweeps)
 
             def advance(k: int, arguments=arguments, chains=tuple(chains)) -> Chain:
-                return jax.block_until_ready(_advanced(self, chains[k], jnp.asarray(k), *arguments))
+                return jax.block_until_ready(advanced(self, chains[k], jnp.asarray(k), *arguments))
 
             chains = list(parallel_map(advance, range(len(chains))).values())
             agree = bool(_difference(chains) < self.config.agreement)
@@ -294,7 +294,7 @@ class Swept(NamedTuple):
 
 
 @eqx.filter_jit
-def _advanced(
+def advanced(
     sampler: Sampler,
     chain: Chain,
     number: Int[Array, ""],

@@ -212,7 +212,8 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
 
     def linearised(self, state: ImplicitState, b: Float[Array, " n"]) -> ImplicitState:
         """Return the state with all grasps linearised at stiffnesses b [N/m], and the belief by a few samples."""
-        state, summary = self._relinearised(state, replace(state.summary, b=b), self.config.relinearise_beyond, 1)
+        at, beyond = replace(state.summary, b=b), self.config.relinearise_beyond
+        state, summary = self._relinearised(state, at, beyond, 1, forced=False)
         return replace(state, summary=summary)
 
     def _refined(self, state: ImplicitState) -> tuple[ImplicitState, PosteriorSummary]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from jiggle_mj.episode import settings
 from jiggle_mj.estimator import Estimator
-from jiggle_mj.estimator.belief.attachment_sampler import Sampler
+from jiggle_mj.estimator.belief.gaussian_information import GaussianInformation
 from jiggle_mj.estimator.belief.posterior_draws import posterior_draws
 from jiggle_mj.estimator.belief.prior import prior_belief
 from jiggle_mj.estimator.blas import one_thread
@@ -162,13 +162,9 @@ def calibration_draw(scene: Scene, reference: CalibrationReference, seed: int) -
     estimator.release()
     belief, detection, attachments = estimator.belief, estimator.detection, estimator.attachment_belief
     with jax.enable_x64(True), one_thread():
-        sampler = Sampler(
-            prior=attachments.prior,
-            precision=attachments.precision,
-            shift=attachments.shift,
-            config=config.belief.sampler,
-        )
-        draws = np.asarray(posterior_draws(sampler, jax.random.key(seed), count=DRAWS, thin=THIN))
+        evidence = GaussianInformation(precision=attachments.precision, shift=attachments.shift)
+        key = jax.random.key(seed)
+        draws = np.asarray(posterior_draws(attachments.prior, evidence, key, count=DRAWS, thin=THIN))
         by_draws = quantities.by_draws(s, draws, rng)
         by_belief = quantities.by_belief(s, attachments, belief, rng)
     b, attached = declaration.membrane_stiffness * s / (1 - s), s > 0

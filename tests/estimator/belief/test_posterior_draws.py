@@ -6,7 +6,7 @@ import numpy as np
 from scipy.stats import norm
 
 from jiggle_mj.estimator.belief.attachment_prior import AttachmentPrior
-from jiggle_mj.estimator.belief.attachment_sampler import Sampler
+from jiggle_mj.estimator.belief.gaussian_information import GaussianInformation
 from jiggle_mj.estimator.belief.posterior_draws import posterior_draws
 from jiggle_mj.estimator.belief.spike_and_slab import SpikeAndSlab
 
@@ -25,8 +25,8 @@ def test_draws_follow_the_posterior_of_each_particle_and_of_what_two_share():
     precision = np.diag([1.0, 1.0, *(1 / variance)])
     precision[:2, :2] += 1e4
     shift = np.array([4e3, 4e3, *(seen / variance)])
-    sampler = Sampler(prior=prior, precision=jnp.asarray(precision), shift=jnp.asarray(shift))
-    draws = np.asarray(posterior_draws(sampler, jax.random.key(0), count=COUNT, thin=3))
+    evidence = GaussianInformation(precision=jnp.asarray(precision), shift=jnp.asarray(shift))
+    draws = np.asarray(posterior_draws(prior, evidence, jax.random.key(0), count=COUNT, thin=3))
     centre, width = np.asarray(stiffness.mean)[:, None], np.asarray(stiffness.sd)[:, None] ** 2
     narrow = 1 / (1 / variance + 1 / width)
     at = narrow * (seen / variance + centre / width)
