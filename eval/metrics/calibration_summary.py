@@ -123,6 +123,8 @@ def headline(summaries: Sequence[ReferenceSummary]) -> str:
         for by_name in summary.ranks.values()
         for name, stats in by_name.items()
     ]
+    if not every:
+        return "No truth was drawn."
     outside = sum(not stats.uniform for *_, stats in every)
     expected = (1 - CURVE_LEVEL) * len(every)
     counts = f"{outside} of {len(every)} rank distributions leave their band, where {expected:.0f} would by chance"

@@ -16,6 +16,7 @@ from typing import ClassVar
 import jax
 import numpy as np
 
+from jiggle_mj.argument_checks import as_integer
 from jiggle_mj.episode import settings
 from jiggle_mj.estimator import Estimator
 from jiggle_mj.estimator.belief.gaussian_information import GaussianInformation
@@ -145,7 +146,11 @@ def calibration_draw(scene: Scene, reference: CalibrationReference, seed: int) -
     """Return the ranks of one draw from the prior.
 
     The attachments are the same for each reference.
+
+    Raises:
+        OptionError: the seed is below 0.
     """
+    seed = as_integer(seed, "seed", at_least=0)
     config, declaration, (mesh, quantities) = (
         estimator_config(reference),
         scene.declared.declaration(),

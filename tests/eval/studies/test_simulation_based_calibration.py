@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jiggle_mj.errors import OptionError
 from jiggle_mj.estimator.belief.attachment_prior import AttachmentPrior
 from jiggle_mj.estimator.belief.prior import PriorConfig, stiffness_prior
 from jiggle_mj.estimator.config import EstimatorConfig
@@ -19,7 +20,7 @@ from jiggle_mj.eval.report.calibration_page import write_calibration_page
 from jiggle_mj.eval.studies.drawn_pulls import POINT_SD, REFERENCES, drawn_pull
 from jiggle_mj.eval.studies.prior_draws import draw_attachments
 from jiggle_mj.eval.studies.same_engine import sheet
-from jiggle_mj.eval.studies.simulation_based_calibration import CalibrationStudy, summaries
+from jiggle_mj.eval.studies.simulation_based_calibration import CalibrationStudy, calibration_draw, summaries
 from jiggle_mj.eval.studies.study import run_study
 from tests.support.small_scene import SCENE
 
@@ -30,7 +31,7 @@ TRUTHS = 40
 
 
 def test_draws_of_the_prior_have_the_probabilities_of_its_joint_law():
-    """Of four particles all 16 states are summed. 2000 draws: a probability errs by 0.011, four times that is allowed.
+    """All 16 states of four particles are summed. 2000 draws: a probability errs by 0.011, four times that is allowed.
     Centres of s are 0.003 to 0.95, equally likely: half of the attached are below 0.06."""
     config = PriorConfig(probability=0.2)
     prior = AttachmentPrior.build(
@@ -120,6 +121,12 @@ def test_the_first_line_says_what_is_found(tmp_path):
     assert (tmp_path / "again.html").read_text() == page
     right = summarised({"exact": [draw(seed, shift=0.0) for seed in range(TRUTHS)]})
     assert headline(right).startswith("Calibrated: ")
+
+
+def test_without_draws_there_is_no_verdict_and_a_wrong_seed_is_refused():
+    assert headline([]) == "No truth was drawn."
+    with pytest.raises(OptionError, match="seed = -1: must be an integer of at least 0"):
+        calibration_draw(BARE, "exact", -1)
 
 
 @pytest.fixture(scope="module")
