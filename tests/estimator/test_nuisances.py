@@ -1,5 +1,7 @@
 """The derivatives by nuisance parameters agree with differences and with Coulomb's law."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -56,5 +58,5 @@ def test_a_sheet_without_a_bed_has_no_friction():
     assert prior_sd(free, height_sd=5e-4) == {HEIGHT: 5e-4}
 
 
-def term(energy: SheetEnergy, kind: type) -> object:
+def term(energy: SheetEnergy, kind: type) -> Any:
     return next(each for each in energy.terms if isinstance(each, kind))
