@@ -1,5 +1,7 @@
 """A filter's posterior as the estimator publishes it: the belief in N/m, and which particles are called attached."""
 
+from statistics import NormalDist
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -19,10 +21,6 @@ MAX_S = 0.999
 """Largest finite end of an interval of s [1]."""
 
 
-INTERVAL_SD = 1.6449
-"""Half width of a 90 % interval of a normal distribution [standard deviation]."""
-
-
 def belief(summary: PosteriorSummary, scale: StiffnessScale | None) -> Belief:
     """Return mean and covariance, and the 90 % intervals of a belief over bounded stiffnesses.
 
@@ -36,8 +34,9 @@ def belief(summary: PosteriorSummary, scale: StiffnessScale | None) -> Belief:
     reference = float(summary.belief.reference)
     lower, upper = (np.asarray(end) for end in summary.belief.interval())
     if scale is not None:
-        s, added = np.clip(mean, 0, 1), scale.added_covariance(np.clip(mean, 0, 1))
-        ends = [_end(end, s, np.diagonal(added), reference) for end in (lower, upper)]
+        s = np.clip(mean, 0, 1)
+        added, sds = scale.added_covariance(s), NormalDist().inv_cdf(1 - summary.belief.config.tail)
+        ends = [_end(end, s, sds**2 * np.diagonal(added), reference) for end in (lower, upper)]
         covariance, reference = covariance + added, scale.factor * reference
         lower, upper = (scale.factor * end for end in ends)
     return Belief(mean=mean, covariance=covariance, reference=reference, lower=lower, upper=upper)
@@ -132,10 +131,10 @@ def force_check(fit: ForceFit | None, scale: StiffnessScale | None) -> ForceChec
 def _end(
     end: Float[np.ndarray, " n"], s: Float[np.ndarray, " n"], added: Float[np.ndarray, " n"], reference: float
 ) -> Float[np.ndarray, " n"]:
-    """Return one end of the intervals of b with `added` variance of s; 0 and infinity stay [N/m]."""
+    """Return one end of the intervals of b, its squared distance in s grown by `added`; 0 and infinity stay [N/m]."""
     inside = (end > 0) & np.isfinite(end)
     at = np.where(inside, end / (np.where(inside, end, 0.0) + reference), s)
-    half = np.sqrt(np.maximum((at - s) ** 2 + INTERVAL_SD**2 * added, 0.0))
+    half = np.sqrt(np.maximum((at - s) ** 2 + added, 0.0))
     at = np.clip(s + np.copysign(half, at - s), 0.0, MAX_S)
     return np.where(inside, reference * at / (1 - at), end)
 

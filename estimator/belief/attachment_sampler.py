@@ -213,8 +213,7 @@ class Sampler(eqx.Module):
         def batch(state):
             component, *others = state
             first = component, self.gaussian.measured(component[:n]), *others
-            has_room = lambda state: (state[-1] < n) & ~state[1].full  # noqa: E731
-            component, _, *others = jax.lax.while_loop(has_room, change, first)
+            component, _, *others = jax.lax.while_loop(lambda state: (state[-1] < n) & ~state[1].full, change, first)
             return component, *others
 
         padded = n + candidates

@@ -257,7 +257,7 @@ class ForceBalance(eqx.Module):
         """Return the state that explains a frame best, for the s of its linearisation."""
         residual = frame.unbalanced + self.apply(frame.dr_dx, frame.innovation)
         pushed = self._transposed(frame.dr_dx, frame.weight[:, None] * residual)
-        position_residual = self._solved(frame, pushed)
+        position_residual = self.solved(frame, pushed)
         return Fit(
             residual=residual,
             force_residual=residual - self.apply(frame.dr_dx, position_residual),
@@ -293,7 +293,7 @@ class ForceBalance(eqx.Module):
     def whitened(self, frame: Frame, v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Return N^-1 v."""
         pushed = self._transposed(frame.dr_dx, frame.weight[:, None] * v)
-        return frame.weight[:, None] * (v - self.apply(frame.dr_dx, self._solved(frame, pushed)))
+        return frame.weight[:, None] * (v - self.apply(frame.dr_dx, self.solved(frame, pushed)))
 
     def residuals(self, frame: Frame, fit: Fit) -> ForceResiduals:
         """Return the whitened residuals of the frame's fit, with their degrees of freedom."""
@@ -392,9 +392,9 @@ class ForceBalance(eqx.Module):
         push = self.reference * weighted - self._transposed(frame.dD_dx, free * weighted)
         if frame.smooth is not None:
             pull = pull + frame.smooth.added_pull(evidence.y - frame.x)
-        return self._solved(frame, pull - push)
+        return self.solved(frame, pull - push)
 
-    def _solved(self, frame: Frame, v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    def solved(self, frame: Frame, v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Return A^-1 v, with the smooth noise in A."""
         solved = solve(self.layout, frame.factor, v)
         return solved if frame.smooth is None else solved + frame.smooth.added_state(solved)

@@ -30,7 +30,7 @@ from .force_balance import ForceBalance
 from .force_fit import ForceFit
 from .frame import Frame, FrameInformation
 from .grasp import GraspFrames
-from .noise import Noise
+from .noise import ForceResiduals, Noise
 from .posterior_summary import Convergence, PosteriorSummary, Update, prior_summary
 
 
@@ -77,10 +77,14 @@ class ImplicitState(FilterState):
         return self.force is not None and self.force.evidence is not None
 
     @property
+    def residuals(self) -> list[ForceResiduals]:
+        """Residuals of the grasps that were linearised again."""
+        return [grasp.residuals for grasp in self.grasps if grasp.residuals is not None]
+
+    @property
     def learned_noise(self) -> Noise:
         """The noise that the residuals of the grasps ask for; the same object where that is the present one."""
-        residuals = [grasp.residuals for grasp in self.grasps if grasp.residuals is not None]
-        return self.noise.learned(residuals) if residuals else self.noise
+        return self.noise.learned(self.residuals) if self.residuals else self.noise
 
 
 class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
@@ -196,8 +200,7 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
 
     def shared_noise(self, state: ImplicitState) -> Noise:
         """See `ForceBalanceFilter.shared_noise`."""
-        residuals = [grasp.residuals for grasp in state.grasps if grasp.residuals is not None]
-        return Noise.shared(residuals) if residuals and self.learns_noise else Noise()
+        return Noise.shared(state.residuals) if state.residuals and self.learns_noise else Noise()
 
     def frames(self, state: ImplicitState) -> Iterator[tuple[Evidence, Float[Array, "n 3"]]]:
         """See `ForceBalanceFilter.frames`."""

@@ -26,7 +26,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..physics.block_tridiagonal import solve
 from ..physics.energy import SheetEnergy
 from ..physics.environment import BedContact, Weight
 from .force_balance import ForceBalance
@@ -84,7 +83,7 @@ def frame_force(balance: ForceBalance, frame: Frame, fit: Fit) -> FrameForce | N
     (elastic, loads), pullback = jax.vjp(sums, frame.x)
     elastic_at_rest, loads_at_rest = sums(energy.rest)
     J = jax.vmap(lambda axis: pullback((axis, axis))[0], out_axes=2)(jnp.eye(3, dtype=d.dtype))
-    Z = jax.vmap(lambda column: _solved(balance, frame, column), in_axes=2, out_axes=2)(J)
+    Z = jax.vmap(lambda column: balance.solved(frame, column), in_axes=2, out_axes=2)(J)
     HZ = jax.vmap(lambda column: balance.apply(frame.dr_dx, column), in_axes=2, out_axes=2)(Z)
     D = balance.calibrated(frame, fit)
     # Where r = 0, the derivative of b d is D / (1 - s); D then counts as far as in the rows.
@@ -127,9 +126,3 @@ def _load_covariance(energy: SheetEnergy, x: Float[Array, "n 3"], loads: Float[A
             pressed = jnp.sum(term.gradient(x[term.vertices]), axis=(0, 1)) @ term.up
             covariance += (FRICTION * pressed) ** 2 * (jnp.eye(3) - jnp.outer(term.up, term.up))
     return covariance
-
-
-def _solved(balance: ForceBalance, frame: Frame, v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Return A^-1 v, with the smooth noise in A."""
-    solved = solve(balance.layout, frame.factor, v)
-    return solved if frame.smooth is None else solved + frame.smooth.added_state(solved)

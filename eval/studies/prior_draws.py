@@ -6,10 +6,8 @@ conditionals of no joint law. So what is drawn is where sweeps over them lead, w
 once from their Dirichlet prior. The sampler of the posterior sweeps over the same conditionals.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.stats import truncnorm
 
 from jiggle_mj.estimator.belief.attachment_prior import AttachmentPrior
@@ -20,21 +18,10 @@ SWEEPS = 100
 after about 50."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DrawnAttachments:
-    """One draw."""
-
-    s: Float[np.ndarray, " n"]
-    """Bounded stiffness of each particle, in [0, 1]; 0 where it is free."""
-
-    @property
-    def attached(self) -> Bool[np.ndarray, " n"]:
-        """Return which particles are attached."""
-        return self.s > 0
-
-
-def draw_attachments(prior: AttachmentPrior, rng: np.random.Generator, *, sweeps: int = SWEEPS) -> DrawnAttachments:
-    """Return a draw of all attachments of a sheet.
+def draw_attachments(
+    prior: AttachmentPrior, rng: np.random.Generator, *, sweeps: int = SWEEPS
+) -> Float[np.ndarray, " n"]:
+    """Return a draw of the bounded stiffnesses of a sheet, in [0, 1]; 0 where a particle is free.
 
     Args:
         prior: of which particles are attached, and how stiffly.
@@ -61,7 +48,7 @@ def draw_attachments(prior: AttachmentPrior, rng: np.random.Generator, *, sweeps
             count = source[:, beside].sum(axis=1)
             own = kernel @ (weights + (count - len(beside) * weights) / (sheet + len(beside)))
             component[i] = np.searchsorted(np.cumsum(own), rng.random() * own.sum())
-    return DrawnAttachments(s=_drawn_stiffness(component, stiffness, rng))
+    return _drawn_stiffness(component, stiffness, rng)
 
 
 def _drawn_stiffness(

@@ -158,7 +158,7 @@ def calibration_draw(scene: Scene, reference: CalibrationReference, seed: int) -
     )
     with jax.enable_x64(True), one_thread():
         prior = prior_belief(mesh, reference=declaration.membrane_stiffness, config=config.prior, belief=config.belief)
-        s = np.minimum(draw_attachments(prior.prior, np.random.default_rng([seed, 0])).s, RIGID)
+        s = np.minimum(draw_attachments(prior.prior, np.random.default_rng([seed, 0])), RIGID)
     rng = np.random.default_rng([seed, 1])
     pull = drawn_pull(scene, reference, s, rng)
     estimator = Estimator(pull.declaration, config=config)

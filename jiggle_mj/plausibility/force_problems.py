@@ -10,7 +10,7 @@ import numpy as np
 
 from ..observation import MeasuredForce, ToolState
 from ..recording.reader import Recording
-from .problem import RecordingProblem
+from .problem import RecordingProblem, warning
 
 DOUBTED_FORCE_N = 50.0
 """Largest change of the force on the tool that is no doubt [N]: tissue tears at less, and mN called N are beyond it."""
@@ -28,7 +28,7 @@ def force_problems(
         frames: the tool in each frame, with the force on it where there is one, in order.
     """
     if recording.why_no_force is not None:
-        yield _warn(
+        yield warning(
             "force-frame",
             f"the force on the tool is not used: {recording.why_no_force} Give it in the world, in a frame that /tf "
             "joins to it, or in the frame '/tool/pose', the axes of the tool.",
@@ -47,14 +47,10 @@ def force_problems(
         largest, done = max(largest, float(np.abs(pull).max())), float(pull @ (tool.position - start))
         work, unsigned = work + done, unsigned + abs(done)
     if largest > DOUBTED_FORCE_N:
-        yield _warn("force-size", f"the force on the tool changes by up to {largest:.3g} N; is it in N, not in mN?")
+        yield warning("force-size", f"the force on the tool changes by up to {largest:.3g} N; is it in N, not in mN?")
     elif work < -GAINED_SHARE * unsigned:
-        yield _warn(
+        yield warning(
             "force-sign",
             "the force pulls the tool the way in which it moves; is it the force of the tissue on the tool, not that "
             "of the tool on the tissue?",
         )
-
-
-def _warn(name: str, text: str) -> RecordingProblem:
-    return RecordingProblem(name=name, refuses=False, text=text)

@@ -15,6 +15,11 @@ class RecordingProblem:
     """What was found, what is usual, and what to do; one sentence or two."""
 
 
+def warning(name: str, text: str) -> RecordingProblem:
+    """Return a problem with which an estimate goes on."""
+    return RecordingProblem(name=name, refuses=False, text=text)
+
+
 def metres(length: float) -> str:
     """Return a length in the unit in which it is easiest to read."""
     for factor, unit in ((1.0, "m"), (1e3, "mm")):

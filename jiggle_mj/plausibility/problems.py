@@ -7,7 +7,7 @@ without a word. docs/RECORDINGS.md has them as a table.
 from collections.abc import Iterator
 from dataclasses import replace
 
-from .problem import RecordingProblem, metres, seconds
+from .problem import RecordingProblem, metres, seconds, warning
 from .survey import Survey
 from .tool_fits import APART
 from .tool_problems import NOISE_MULTIPLES
@@ -67,9 +67,9 @@ def _use(survey: Survey) -> Iterator[RecordingProblem]:
         )
         return
     if survey.grasps == 1:
-        yield _warn("one-grasp", "one grasp only: several, at different places, show more of the attachments.")
+        yield warning("one-grasp", "one grasp only: several, at different places, show more of the attachments.")
     if survey.sensing == "cloud":
-        yield _warn(
+        yield warning(
             "no-identities",
             "points are not the same from frame to frame, as they have no track_id: only the shape of the surface "
             "shows, not what slides along it.",
@@ -86,7 +86,7 @@ def _use(survey: Survey) -> Iterator[RecordingProblem]:
             refuses=survey.grip_share == 1,
         )
     if survey.unseen is not None and survey.unseen > MAX_UNSEEN:
-        yield _warn("unseen", f"{survey.unseen:.0%} of the points are not seen; is a missing value read as such?")
+        yield warning("unseen", f"{survey.unseen:.0%} of the points are not seen; is a missing value read as such?")
 
 
 def _size(survey: Survey) -> Iterator[RecordingProblem]:
@@ -104,7 +104,7 @@ def _size(survey: Survey) -> Iterator[RecordingProblem]:
             f"Are these {unit}? Lengths of a recording are in metres; set 'unit' in recording.toml.",
         )
     elif not _within(size, DOUBTED_EXTENT_M):
-        yield _warn("extent", f"the sheet is {metres(size)} wide; is the unit of length right?")
+        yield warning("extent", f"the sheet is {metres(size)} wide; is the unit of length right?")
 
 
 def _times(survey: Survey) -> Iterator[RecordingProblem]:
@@ -118,11 +118,11 @@ def _times(survey: Survey) -> Iterator[RecordingProblem]:
             f"a frame comes every {seconds(period)}; times are in seconds (are these milliseconds or nanoseconds?).",
         )
     elif not _within(period, DOUBTED_PERIOD_S):
-        yield _warn(
+        yield warning(
             "period", f"a frame comes every {seconds(period)}; are the times in seconds, not in milliseconds or ns?"
         )
     if gap is not None and gap > max(GAP_PERIODS * period, MIN_GAP_S):
-        yield _warn("gap", f"{seconds(gap)} without a frame while the jaws are closed, where one comes every "
+        yield warning("gap", f"{seconds(gap)} without a frame while the jaws are closed, where one comes every "
                     f"{seconds(period)}; are frames lost, or is a release missing?")  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def _camera(survey: Survey) -> Iterator[RecordingProblem]:
         )
         return
     if not _within(baseline, DOUBTED_BASELINE_M):
-        yield _warn("baseline", f"the cameras are {metres(baseline)} apart; is the baseline in metres?")
+        yield warning("baseline", f"the cameras are {metres(baseline)} apart; is the baseline in metres?")
     depth, disparity = survey.tool_depth_m, survey.tool_disparity_px
     if depth is None:
         return
@@ -157,7 +157,7 @@ def _camera(survey: Survey) -> Iterator[RecordingProblem]:
             f"{size[0]} px wide; at most half of it can be matched: are baseline and poses in one unit?",
         )
     elif not survey.tool_in_view:
-        yield _warn("tool-view", "the tool is outside the left image when the jaws close; do /tf and its pose fit?")
+        yield warning("tool-view", "the tool is outside the left image when the jaws close; do /tf and its pose fit?")
 
 
 def _tool(survey: Survey) -> Iterator[RecordingProblem]:
@@ -175,7 +175,7 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
             )
             return
         if distance > DOUBTED_TOOL_DISTANCE * size:
-            yield _warn(
+            yield warning(
                 "tool-distance",
                 f"the tool is {metres(distance)} from the points that it holds, on a sheet {metres(size)} wide; is it "
                 "the tip that is reported, in the frame of the points?",
@@ -186,7 +186,7 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
     noise = NOISE_MULTIPLES * (survey.noise_sd_m or 0.0)
     if (held is None or held <= noise) and tool <= noise and (survey.closed_frames > 1 or not survey.tool_by_points):
         if survey.points_motion_m is None:
-            yield _warn("tool-still", "the tool does not move; nothing can be learned from it.")
+            yield warning("tool-still", "the tool does not move; nothing can be learned from it.")
         elif survey.points_motion_m <= noise:
             yield _refuse(
                 "no-motion",
@@ -196,7 +196,7 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
             )
         elif survey.sensing == "points":
             them = "those that the tool holds " + ("do not" if held is not None else "are never seen while it pulls")
-            yield _warn("held-still", f"points move, and {them}; are the held rows right?")
+            yield warning("held-still", f"points move, and {them}; are the held rows right?")
     still = held is not None and tool < STILL_SHARE * held
     apart = held is not None and survey.tool_gap_m is not None and survey.tool_gap_m > max(held, tool) + noise
     if survey.why_apart is not None:
@@ -211,7 +211,7 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
             "and frames overlap (one since 1970 or in ms: tool_clock_offset, tool_time_unit), and are both in metres?",
         )
     elif held < STILL_SHARE * tool:
-        yield _warn(
+        yield warning(
             "held-still",
             f"the tool moves {metres(tool)} and the points that it holds {metres(held)}; did they slip, are the held "
             "rows right, or is the tool's unit or clock another one?",
@@ -224,13 +224,15 @@ def _tool(survey: Survey) -> Iterator[RecordingProblem]:
             "clock late, or its frame another one?",
         )
     elif survey.tool_gap_m is not None and survey.tool_gap_m > max(APART * max(held, tool), noise):
-        yield _warn(
+        yield warning(
             "tool-gap",
             f"tool and held points move apart by {metres(survey.tool_gap_m)} while they move {metres(held)}; does the "
             "tool's clock lag, does it turn without saying so, or do points slip?",
         )
     if survey.tool_speed_m_s is not None and survey.tool_speed_m_s > MAX_TOOL_SPEED_M_S:
-        yield _warn("tool-speed", f"the tool moves at up to {survey.tool_speed_m_s:.3g} m/s; are times and unit right?")
+        yield warning(
+            "tool-speed", f"the tool moves at up to {survey.tool_speed_m_s:.3g} m/s; are times and unit right?"
+        )
 
 
 def _noise(survey: Survey) -> Iterator[RecordingProblem]:
@@ -239,13 +241,13 @@ def _noise(survey: Survey) -> Iterator[RecordingProblem]:
     if declared is None or measured is None or survey.sensing != "points":
         return
     if measured > MAX_NOISE_RATIO * declared:
-        yield _warn(
+        yield warning(
             "noise",
             f"the noise is declared as {metres(declared)} and measured as {metres(measured)} ({survey.noise_from}); "
             "the larger one counts where still frames show it: set noise_sd to what is measured.",
         )
     elif survey.noise_from == "still frames" and declared > NOISE_MULTIPLES * measured > 0:  # 0: rounded, or none
-        yield _warn(
+        yield warning(
             "noise",
             f"the noise is declared as {metres(declared)}, and still frames show {metres(measured)}; unless it has "
             "parts that do not change with time, a smaller noise_sd shows more attachments.",
@@ -262,7 +264,3 @@ def _problem(name: str, text: str, *, refuses: bool) -> RecordingProblem:
 
 def _refuse(name: str, text: str) -> RecordingProblem:
     return _problem(name, text, refuses=True)
-
-
-def _warn(name: str, text: str) -> RecordingProblem:
-    return _problem(name, text, refuses=False)

@@ -7,7 +7,7 @@ from collections import defaultdict
 from tests.support.sources import ROOT
 
 PAGE = (ROOT / "docs" / "RECORDINGS.md").read_text(encoding="utf-8")
-CALLS = {"_refuse": {True}, "_warn": {False}, "_problem": {True, False}, "RecordingProblem": {True, False}}
+CALLS = {"_refuse": {True}, "warning": {False}, "_problem": {True, False}, "RecordingProblem": {True, False}}
 """Calls that make a problem, and whether it may refuse where the call does not say."""
 
 

@@ -41,7 +41,7 @@ def test_draws_of_the_prior_have_the_probabilities_of_its_joint_law():
     log = states.sum(axis=1) * np.log(0.25) + (states[:, EDGES[:, 0]] * states[:, EDGES[:, 1]]).sum(axis=1)
     weight = np.exp(log) / np.exp(log).sum()
     rng = np.random.default_rng(0)
-    s = np.array([draw_attachments(prior, rng, sweeps=10).s for _ in range(2000)])
+    s = np.array([draw_attachments(prior, rng, sweeps=10) for _ in range(2000)])
     np.testing.assert_allclose((s > 0).mean(axis=0), weight @ states, atol=0.045)
     together = (s[:, 0] > 0) & (s[:, 2] > 0)
     assert together.mean() == pytest.approx(weight @ (states[:, 0] * states[:, 2]), abs=0.045)
