@@ -115,5 +115,5 @@ def for_clouds(config: EstimatorConfig) -> EstimatorConfig:
     """Return the settings with those of the filter 'implicit' for clouds without identities in place of the others."""
     if config.filter != "implicit":
         return config
-    belief = replace(config.belief, mesh_transfer=config.belief.cloud_mesh_transfer)
+    belief = replace(config.belief, edge_transfer=config.belief.cloud_edge_transfer)
     return replace(config, force_sd=config.cloud_force_sd, belief=belief)

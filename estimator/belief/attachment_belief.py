@@ -243,8 +243,8 @@ class AttachmentBelief(eqx.Module):
         """Return the marginal posterior of each particle; call `sweep` before."""
         gaussian = self.gaussian()
         mixture, _ = self._mixture(*self._cavity(gaussian))
-        transfer = jnp.sum(self._transfer_variance(gaussian.mean), axis=1)
-        mean, sd = jnp.clip(gaussian.mean, 0, MAX_MEAN), jnp.sqrt(gaussian.variance + transfer)
+        mean = jnp.clip(gaussian.mean, 0, MAX_MEAN)
+        sd = jnp.sqrt(gaussian.variance + self._mesh_variance(gaussian.mean))
         return Posterior(
             mean=mean,
             sd=sd,
@@ -255,11 +255,15 @@ class AttachmentBelief(eqx.Module):
         )
 
     def moments(self) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-        """Return mean and covariance of s, with the transfer between neighbours, which leaves sums of s unchanged."""
+        """Return mean and covariance of s, with what the mesh adds to it.
+
+        The transfer between neighbours leaves sums of s as they are, and the common error leaves their ratios.
+        """
         gaussian, rows = self.gaussian(), jnp.arange(len(self.shift))
-        transfer = self._transfer_variance(gaussian.mean)
+        transfer, common = self._transfer_variance(gaussian.mean), self._common_sd(gaussian.mean)
         covariance = gaussian.covariance().at[rows[:, None], self.prior.neighbours].add(-transfer, mode="drop")
-        return gaussian.mean, covariance.at[rows, rows].add(jnp.sum(transfer, axis=1))
+        covariance = covariance.at[rows, rows].add(jnp.sum(transfer, axis=1))
+        return gaussian.mean, covariance + common[:, None] * common[None]
 
     def entropy(self) -> Float[Array, ""]:
         """Return the differential entropy of the Gaussian over s [nat]."""
@@ -274,8 +278,8 @@ class AttachmentBelief(eqx.Module):
         """
         tail, gaussian = self.config.tail, self.gaussian()
         mixture, _ = self._mixture(*self._cavity(gaussian))
-        transfer = jnp.sum(self._transfer_variance(gaussian.mean), axis=1)
-        mixture = eqx.tree_at(lambda parts: parts.sd, mixture, jnp.sqrt(mixture.sd**2 + transfer[None]))
+        added = self._mesh_variance(gaussian.mean)
+        mixture = eqx.tree_at(lambda parts: parts.sd, mixture, jnp.sqrt(mixture.sd**2 + added[None]))
         may_be_free = 1 - mixture.attached > tail
         low, high = mixture.quantile(tail), mixture.quantile(1 - tail)
         lower = jnp.where(may_be_free, 0.0, self.stiffness(low))
@@ -290,24 +294,31 @@ class AttachmentBelief(eqx.Module):
         """Return the log odds of being attached by the prior and the messages of the neighbours."""
         return self.prior.log_odds + jnp.sum(self.message, axis=1)
 
+    def _mesh_variance(self, s: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the variance of each s that the mesh adds to it."""
+        return jnp.sum(self._transfer_variance(s), axis=1) + self._common_sd(s) ** 2
+
+    def _common_sd(self, s: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the standard deviation of each s by what all b have in common, as ds = s (1 - s) d ln b."""
+        s = jnp.clip(s, 0, 1)
+        return self.config.common_error * s * (1 - s)
+
     def _transfer_variance(self, s: Float[Array, " n"]) -> Float[Array, "n d"]:
         """Return the variance of what the mesh assigns to each neighbour instead of to the particle.
 
-        Neighbouring particles share an attachment that lies between them, and a spring at each of them lets the sheet
-        rotate about another point than the attachment does. So the share that fits the frames best is not the share by
-        virtual work, in all grasps alike. The sum of s is not affected.
+        Neighbouring particles share an attachment that lies between them. The share by virtual work keeps its force and
+        its place, but springs at the particles resist a turn of the sheet more than the attachment does. So the
+        particles in the middle of a narrow band come out stiffer than that share, and those at its edges softer, in all
+        grasps alike: a part of the difference between neighbours belongs to the softer one. The sum of s is not
+        affected.
 
-        A soft attachment that ends between two particles acts on both by virtual work. A rigid one does not: its rim is
-        a hinge, and a particle just outside of the rim may move like a free one though the nearest part is rigid. So
-        the share of the difference that belongs to the other is known there only to be in [0, 1]; it enters in
-        proportion to how rigid the two are.
+        Where a rigid attachment ends between two particles its rim is a hinge, and a particle just outside of it may
+        move like a free one though the nearest part is rigid. There it is either free or rigid.
         """
         s = jnp.append(jnp.clip(s, 0, 1), 0.0)
-        own, other = s[:-1, None], s[self.prior.neighbours]
-        between = (own + other) / 2
-        inside = self.config.mesh_transfer * between * (1 - between)
-        rim = self.config.rim_transfer * (own - other) * (own + other)
-        variance = inside**2 + rim**2
+        own, other, config = s[:-1, None], s[self.prior.neighbours], self.config
+        part = config.edge_transfer + (config.rim_transfer - config.edge_transfer) * jnp.maximum(own, other) ** 2
+        variance = (part * (own - other)) ** 2
         return jnp.where(self.prior.neighbours < len(self.shift), variance, 0.0)
 
     def _cavity(self, gaussian: Gaussian) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

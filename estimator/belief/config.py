@@ -41,16 +41,17 @@ class BeliefConfig:
     learning_rate: float = 0.2
     """Share of a step of expectation maximisation that the component weights take in a sweep. With a rate of 1 a
     particle that is attached with a probability of about one half changes the weights, and they change it back."""
-    mesh_transfer: float = 0.08
-    """Standard deviation of the share of an attachment that a mesh assigns to the neighbour along each edge instead,
-    from images of the shipped scenes. It is scaled by s (1 - s): a free particle has nothing to assign and a weld does
-    not become softer."""
-    cloud_mesh_transfer: float = 0.3
+    edge_transfer: float = 0.12
+    """Standard deviation of the part of the difference between two neighbours that belongs to the softer one, where
+    both are soft: with it NEES from images of `line` is 1."""
+    cloud_edge_transfer: float = 0.25
     """The same for clouds without identities: they show where the sheet bends, and not which of two neighbours bends
     it. Chosen on one recording each of `arc` and `line`."""
-    rim_transfer: float = 12**-0.5
-    """The same share where a rigid attachment ends between two neighbours: that of a rim of which only is known that it
-    lies between them. It is scaled by the difference of their s and by their sum, as a soft attachment acts on both."""
+    rim_transfer: float = 0.5
+    """The same where the stiffer one is rigid: that of all or nothing, equally likely."""
+    common_error: float = 0.06
+    """Standard deviation of the logarithm of the factor that all attachments of a sheet have in common, as one mesh's
+    forces are not another's [nat]. From images of `arc` and `line` sums of b are 0.94 of the truth."""
     open_above: float = 0.9
     """Bounded stiffness above which the upper end of an interval is infinite: nine times b_ref and a weld
     differ by less than the mesh resolves."""
@@ -63,7 +64,7 @@ class BeliefConfig:
         """Check types and ranges."""
         shares = ("damping", "learning_rate", "open_above")
         check_ranges(self, positive=shares, shares=shares)
-        for name in ("mesh_transfer", "cloud_mesh_transfer", "rim_transfer"):
+        for name in ("edge_transfer", "cloud_edge_transfer", "rim_transfer", "common_error"):
             as_number(getattr(self, name), f"BeliefConfig.{name}", at_least=0)
         as_number(self.tail, "BeliefConfig.tail", above=0, below=0.5)
         check_parts(self)

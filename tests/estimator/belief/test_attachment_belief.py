@@ -17,7 +17,9 @@ COMPONENTS, SPREAD = (0.03, 0.3), 0.5
 STIFFNESS = SpikeAndSlab.build(spike=3e-3, components=COMPONENTS, spread=SPREAD, dirichlet_strength=1e12, partial=0.0)
 """With so many equal particles beforehand that the weights stay as they are."""
 PROBABILITY, REFERENCE = 0.1, 30.0
-NO_TRANSFER = BeliefConfig(mesh_transfer=0.0, rim_transfer=0.0)
+NO_MESH_ERROR = {"edge_transfer": 0.0, "rim_transfer": 0.0, "common_error": 0.0}
+"""Settings of a belief whose mesh represents any attachment."""
+NO_TRANSFER = BeliefConfig(**NO_MESH_ERROR)
 CONVERGED = 1e-6
 """Relative; error of a fixed point after 30 damped sweeps."""
 EP_ERROR = 0.05
@@ -120,18 +122,19 @@ def test_intervals_open_upwards_where_only_a_lower_end_is_known():
     assert lower[2] > 4 * REFERENCE and upper[2] == np.inf
 
 
-def test_transfer_by_the_mesh_adds_to_each_variance_and_leaves_sums_unchanged():
-    """A third of the attachment between two neighbours, one of them attached: equal at both, none in the sum."""
-    mean, variance = np.array([0.0, 0.1, 0.0]), np.full(3, 1e-6)
+def test_a_part_of_the_difference_between_neighbours_adds_to_each_variance_and_not_to_sums():
+    """A narrow band: the two particles at its edges may have more, by a part of the difference on each edge."""
+    mean, variance = np.array([0.004, 0.05, 0.004]), np.full(3, 1e-8)
     summary = []
-    for transfer in (0.0, 1 / 3):
-        belief = chain(3, coupling=0.0, config=BeliefConfig(mesh_transfer=transfer, rim_transfer=0.0))
+    for part in (0.0, 0.1):
+        belief = chain(
+            3, coupling=0.0, config=BeliefConfig(**{**NO_MESH_ERROR, "edge_transfer": part, "rim_transfer": part})
+        )
         belief = belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance))
         summary.append((np.asarray(moments(belief)[1]), posterior(belief).sd, interval(belief)))
     (sharp, sharp_sd, sharp_interval), (wide, wide_sd, wide_interval) = summary
     s = np.asarray(moments(belief)[0])
-    first, second = ((s[i] + s[i + 1]) / 2 * (1 - (s[i] + s[i + 1]) / 2) / 3 for i in (0, 1))
-    edges = np.array([[1, -1, 0], [0, 1, -1]]) * np.array([[first], [second]])
+    edges = np.array([[1, -1, 0], [0, 1, -1]]) * 0.1 * np.diff(s)[:, None]
     np.testing.assert_allclose(wide - sharp, edges.T @ edges, atol=1e-12)
     np.testing.assert_allclose(wide.sum(), sharp.sum(), rtol=1e-6)
     np.testing.assert_allclose(wide_sd**2 - sharp_sd**2, np.diagonal(edges.T @ edges), rtol=1e-6)
@@ -139,13 +142,24 @@ def test_transfer_by_the_mesh_adds_to_each_variance_and_leaves_sums_unchanged():
     assert (np.asarray(wide_interval[1]) > np.asarray(sharp_interval[1])).all()
 
 
+def test_the_common_error_adds_to_the_sum_and_not_to_ratios():
+    mean, variance = np.array([0.02, 0.05, 0.04]), np.full(3, 1e-8)
+    belief = chain(3, coupling=0.0, config=BeliefConfig(**{**NO_MESH_ERROR, "common_error": 0.06}))
+    belief = belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance))
+    covariance, ratio = np.asarray(moments(belief)[1]), np.array([0.05 * 0.95, -0.02 * 0.98, 0.0])
+    common = 0.06 * np.sum(mean * (1 - mean))
+    assert covariance.sum() == pytest.approx(common**2 + variance.sum(), rel=0.01)
+    assert ratio @ covariance @ ratio == pytest.approx(ratio @ (variance * ratio), rel=0.05)
+    np.testing.assert_allclose(posterior(belief).sd ** 2, np.diagonal(covariance), rtol=1e-6)
+
+
 def test_a_particle_at_the_rim_of_a_weld_may_have_any_stiffness():
     """Measured as nearly free beside a weld, its deviation is that of a share in [0, 1]; not so beside a soft one."""
     mean, variance = np.array([0.9, 0.05, 0.0, 0.05, 0.1]), np.full(5, 1e-6)
-    belief = chain(5, coupling=0.0, config=BeliefConfig(mesh_transfer=0.0))
+    belief = chain(5, coupling=0.0, config=BeliefConfig(**{**NO_MESH_ERROR, "rim_transfer": 0.5}))
     belief = belief.add(jnp.diag(jnp.asarray(1 / variance)), jnp.asarray(mean / variance))
     sd = np.asarray(posterior(belief).sd)
-    assert sd[1] == pytest.approx((0.9**2 - 0.05**2) / np.sqrt(12), rel=1e-2)
+    assert sd[1] == pytest.approx(0.9**2 * (0.9 - 0.05) / 2, rel=1e-2)
     assert sd[3] < 0.05 / 10
     assert float(jnp.sum(moments(belief)[1])) == pytest.approx(variance.sum(), rel=1e-2)
     lower, upper = (np.asarray(end) for end in interval(belief))
@@ -160,7 +174,7 @@ def test_stiffness_and_its_bounded_form_are_inverse():
 
 
 @pytest.mark.parametrize(
-    "setting", [{"damping": 0.0}, {"learning_rate": 1.5}, {"mesh_transfer": -0.1}, {"open_above": 2.0}, {"tail": 0.5}]
+    "setting", [{"damping": 0.0}, {"learning_rate": 1.5}, {"edge_transfer": -0.1}, {"open_above": 2.0}, {"tail": 0.5}]
 )
 def test_settings_outside_of_their_range_are_refused(setting):
     (name,) = setting
