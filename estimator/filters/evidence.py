@@ -74,7 +74,7 @@ class Evidence(eqx.Module):
         held = jnp.where(self.held[:, None, None], self.precision, 0.0)
         return eqx.tree_at(lambda e: (e.precision, e.cloud), self, (held, None), is_leaf=lambda leaf: leaf is None)
 
-    def inflated(self, variance: float) -> "Evidence":
+    def inflated(self, variance: float | Float[Array, ""]) -> "Evidence":
         """Return the evidence with `variance` times the variance of what was seen; the held particles keep theirs."""
         precision = jnp.where(self.held[:, None, None], self.precision, self.precision / variance)
         fields = None if self.fields is None else self.fields * jnp.sqrt(variance)

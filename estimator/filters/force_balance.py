@@ -135,7 +135,7 @@ class ForceBalance(eqx.Module):
             config=config or FilterConfig(),
         )
 
-    def inflated(self, variance: float) -> "ForceBalance":
+    def inflated(self, variance: float | Float[Array, ""]) -> "ForceBalance":
         """Return the balance with `variance` times the variance of the force error."""
         return eqx.tree_at(lambda balance: balance.force_sd, self, self.force_sd * jnp.sqrt(variance))
 

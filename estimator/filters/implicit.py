@@ -28,7 +28,7 @@ from .evidence import Evidence
 from .filter import FilterState, ForceBalanceFilter, Region
 from .force_balance import ForceBalance
 from .force_fit import ForceFit
-from .frame import Frame, FrameInformation
+from .frame import FrameInformation
 from .grasp import GraspFrames
 from .noise import ForceResiduals, Noise
 from .posterior_summary import Convergence, PosteriorSummary, Update, prior_summary
@@ -131,13 +131,11 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
         self, state: ImplicitState, evidence: Evidence, start: Float[Array, "n 3"]
     ) -> tuple[ImplicitState, Update]:
         """See `Filter.update`: settle the sheet near what was seen, linearise there, add the evidence, sweep once."""
-        s, balance = state.belief.bounded(state.summary.b), self.balance(state)
-        inflated = evidence.inflated(state.noise.position)
-        frame, information = balance.settled_evidence(start, s, inflated)
-        update = _updated(balance, state.belief, frame, information, inflated)
+        noise = jnp.asarray(state.noise.force), jnp.asarray(state.noise.position)
+        update, information = _updated(state.balance, state.belief, state.summary.b, evidence, start, noise)
         if not update.explains_the_frame:
             return state, update
-        *before, last = (*state.grasps, GraspFrames.empty(len(s))) if state.between_grasps else state.grasps
+        *before, last = (*state.grasps, GraspFrames.empty(len(start))) if state.between_grasps else state.grasps
         grasps = (*before, last.with_frame(evidence, update.x, information))
         return replace(state, summary=update, grasps=grasps, between_grasps=False), update
 
@@ -340,14 +338,24 @@ def _with_release(state: ImplicitState, summary: PosteriorSummary) -> tuple[Impl
 
 @eqx.filter_jit
 def _updated(
-    balance: ForceBalance, belief: AttachmentBelief, frame: Frame, information: FrameInformation, evidence: Evidence
-) -> Update:
-    """Return the belief after a frame's evidence, and the state for it."""
+    balance: ForceBalance,
+    belief: AttachmentBelief,
+    b: Float[Array, " n"],
+    evidence: Evidence,
+    start: Float[Array, "n 3"],
+    noise: tuple[Float[Array, ""], Float[Array, ""]],
+) -> tuple[Update, FrameInformation]:
+    """Return the belief after a frame, with the state for it, and the frame's evidence, as one program.
+
+    `balance` and `evidence` have the assumed noise; `noise` has the factors on the variances of forces and positions.
+    """
+    s, balance, evidence = belief.bounded(b), balance.inflated(noise[0]), evidence.inflated(noise[1])
+    frame, information = balance.settled_evidence(start, s, evidence)
     belief, gaussian = belief.updated(information.precision, information.shift)
     nis = _normalised_innovation(information, gaussian, frame.evidence)
     summary = _summary(belief, Convergence.SEARCH_CUT_OFF.unless(frame.converged))
     x = balance.polish(frame, belief.bounded(summary.b))
-    return Update(**vars(summary), x=x, nis=nis)
+    return Update(**vars(summary), x=x, nis=nis), information
 
 
 @eqx.filter_jit

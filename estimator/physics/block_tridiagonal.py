@@ -26,7 +26,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 ORDER_DIRECTIONS = 36
 """Directions in the sheet's plane along which an order of the particles is tried: one every 5 degrees."""
 MAX_SUBSTITUTION_SIZE = 64
-"""Largest triangular matrix that is inverted by substitution; larger ones are inverted by halves [rows]."""
+"""Largest triangular matrix that a CPU inverts by substitution; larger ones it inverts by halves [rows]."""
 
 
 class Layout(eqx.Module):
@@ -163,13 +163,24 @@ def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
 
 
 def lower_inverse(factor: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Return the inverse of a lower triangular matrix, by halves: products are several times faster than solves."""
+    """Return the inverse of a lower triangular matrix: by halves on a CPU, whose products are faster than its solves.
+
+    On a GPU one solve takes less time than the launches of the products.
+    """
+    return jax.lax.platform_dependent(factor, cpu=_inverse_by_halves, default=_inverse_by_substitution)
+
+
+def _inverse_by_halves(factor: Float[Array, "m m"]) -> Float[Array, "m m"]:
     m = len(factor)
     if m <= MAX_SUBSTITUTION_SIZE:
-        return solve_triangular(factor, jnp.eye(m, dtype=factor.dtype), lower=True)
-    first, last = lower_inverse(factor[: m // 2, : m // 2]), lower_inverse(factor[m // 2 :, m // 2 :])
+        return _inverse_by_substitution(factor)
+    first, last = _inverse_by_halves(factor[: m // 2, : m // 2]), _inverse_by_halves(factor[m // 2 :, m // 2 :])
     corner = -last @ (factor[m // 2 :, : m // 2] @ first)
     return jnp.block([[first, jnp.zeros_like(corner.T)], [corner, last]])
+
+
+def _inverse_by_substitution(factor: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    return solve_triangular(factor, jnp.eye(len(factor), dtype=factor.dtype), lower=True)
 
 
 def multiply(layout: Layout, matrix: BlockTridiagonal, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

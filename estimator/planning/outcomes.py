@@ -1,6 +1,7 @@
 """Predict many pulls in many scenarios: `PullPredictor.outcome` of every pair of them."""
 
 import math
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -13,6 +14,10 @@ from .pull_predictor import CandidatePull, Outcome, PullPredictor
 
 BATCH = 32
 """Pairs of pull and scenario that GPUs predict together. With a fixed number one compilation serves all."""
+
+COMPILER_OPTIONS = {"xla_gpu_enable_triton_gemm": False, "xla_gpu_autotune_level": 0}
+"""Options of the compiler for a batch of small products, for each of which it would compile and time dozens of kernels
+of its own, for minutes. Without them a batch takes 0.117 s instead of 0.114 s on an H200."""
 
 
 def outcomes(
@@ -51,7 +56,7 @@ def outcomes_in_batches(
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), flat)
 
 
-@eqx.filter_jit
+@partial(jax.jit, static_argnames="informative", compiler_options=COMPILER_OPTIONS)
 def _batch_outcomes(
     predictor: PullPredictor, pulls: CandidatePull, s: Float[Array, "batch n"], *, informative: bool
 ) -> Outcome:

@@ -15,21 +15,24 @@ from .terminal import FAILED, console, log
 
 
 def bench(
-    part: Annotated[Literal["estimator", "reference"], tyro.conf.Positional] = "estimator",
+    part: Annotated[Literal["estimator", "plan", "reference"], tyro.conf.Positional] = "estimator",
     /,
     *,
     sizes: tuple[int, ...] | None = None,
+    paper: bool = True,
     gate: bool = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the speed of the estimator or of the reference tissue on this machine.
+    """Measure the speed of the estimator, of a plan or of the reference tissue on this machine.
 
     Prints the median time of each part; compile time is separate.
 
     Args:
-        part: what to time: the estimator, or the reference tissue.
+        part: what to time: the estimator, a plan of the policy 'information', or the reference tissue.
         sizes: approximate numbers of particles (default 600 1200; the first is also run with the paper's filter, and
-            above 10000 only the solver is timed), or of the reference's vertices (default 300 625 1200 2500).
+            above 10000 only the solver is timed; for a plan 600), or of the reference's vertices (default 300 625 1200
+            2500).
+        paper: time the paper's filter and controller too, which takes minutes on a CPU.
         gate: exit with 1 where a figure is worse than the committed baseline allows.
         as_json: print the figures to stdout as JSON.
     """
@@ -39,8 +42,12 @@ def bench(
         from jiggle_mj.eval.benchmark import reference_benchmark as reference
 
         metrics = reference.reference_benchmark(sizes or reference.SIZES, log=log)
+    elif part == "plan":
+        from jiggle_mj.eval.benchmark import plan_benchmark as plan
+
+        metrics = plan.plan_benchmark(sizes or plan.SIZES, log=log)
     else:
-        metrics = benchmark(sizes or SIZES, paper=True, log=log)
+        metrics = benchmark(sizes or SIZES, paper=paper, log=log)
     table = Table("", "figure", "", box=None)
     for name, entry in metrics.items():
         value = entry["value"]
