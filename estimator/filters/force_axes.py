@@ -20,8 +20,12 @@ MAX_FACTOR = 20.0
 ten; mN are off by 1000, and gram-force by 100."""
 SIGNIFICANT = 4.0
 """Squared norm above which a difference or a force is no noise [standard deviations of that of noise]."""
+FACTOR_ERRORS = 2.0
+"""Standard deviations of that factor by which it must be below a limit [1]."""
 UNITS = ((1e3, "mN"), (1e2, "cN or gram-force"), (1e-3, "kN"))
 """Factor on a force in N, and the unit that gives it."""
+DEAD = "the measured force shows nothing of what the sheet needs, but noise; is the sensor on, and recorded?"
+"""Why a force is not used that stays at its offset."""
 
 
 def doubt(
@@ -40,6 +44,10 @@ def doubt(
         sd: standard deviation of the difference of each component [N].
         sd_given: the same with the attachments as they are believed; the sign shows by it, as no attachment pushes.
     """
+    if not _is_significant(pull / sd_given):
+        information = max(float(np.sum((predicted / sd) ** 2)), np.finfo(float).tiny)  # about the factor
+        if _apart(predicted, pull, loads, sd)[1] + FACTOR_ERRORS * information**-0.5 < 1 / MAX_FACTOR:
+            return DEAD
     turned = -np.eye(3)
     apart, factor = _apart(predicted, pull, loads, sd_given)
     if apart > APART and _is_significant((pull - loads - factor * predicted) / sd_given):
@@ -71,7 +79,8 @@ def _apart(
     """Return the share of the force that the best positive factor leaves, and that factor [true over declared]."""
     E, L = predicted / sd, (pull - loads) / sd
     factor = max(float(np.sum(E * L) / max(np.sum(E * E), np.finfo(float).tiny)), 0.0)
-    return float(np.sqrt(np.sum((L - factor * E) ** 2) / np.sum((pull / sd) ** 2))), factor
+    measured = max(float(np.sum((pull / sd) ** 2)), 1.0)  # less is noise of one component, or no force at all
+    return float(np.sqrt(np.sum((L - factor * E) ** 2) / measured)), factor
 
 
 def _is_significant(scores: Float[np.ndarray, "t 3"]) -> bool:

@@ -142,6 +142,7 @@ def test_with_a_sure_declared_stiffness_the_force_halves_the_error_of_the_sum():
 PREDICTED = np.array([[0.02, 0.03, 0.1], [-0.04, 0.02, 0.2], [0.03, -0.05, 0.15], [-0.02, -0.03, 0.1]])
 LOADS = np.array([0.0, 0.0, 0.03])
 SD = np.full(PREDICTED.shape, 5e-3)
+DEAD_SENSOR = np.random.default_rng(0).normal(size=SD.shape) * SD
 
 
 @pytest.mark.parametrize(
@@ -152,15 +153,26 @@ SD = np.full(PREDICTED.shape, 5e-3)
         (lambda f: f[:, [1, 2, 0]] * [-1, 1, 1], r"\(x, y, z\) = \(z, -x, y\)"),
         (lambda f: 1000 * f, "is it in mN"),
         (lambda f: f[::-1] * [1, 1, 0], "whatever its scale and axes"),
+        (lambda f: 0 * f + 0.1, "whatever its scale and axes"),
+        (lambda f: 0 * f, "is the sensor on"),
+        (lambda f: 0 * f - 1e-17, "is the sensor on"),
+        (lambda f: DEAD_SENSOR, "is the sensor on"),
     ],
 )
 def test_a_force_of_another_sign_axes_or_unit_is_named(change, words):
-    why = doubt(PREDICTED, change(PREDICTED + LOADS), np.tile(LOADS, (4, 1)), SD, SD)
+    with np.errstate(all="raise"):
+        why = doubt(PREDICTED, change(PREDICTED + LOADS), np.tile(LOADS, (4, 1)), SD, SD)
     if words is None:
         assert why is None
     else:
         assert why is not None
         assert re.search(words, why), why
+
+
+def test_no_force_is_not_doubted_where_none_is_expected():
+    """Nothing holds the sheet, and it weighs nothing."""
+    none = np.zeros_like(SD)
+    assert doubt(none, none, none, SD, SD) is None
 
 
 def test_a_force_below_its_noise_is_not_doubted():
