@@ -112,7 +112,14 @@ def import_folder(
     vertices = None if mesh is None else mesh.vertices
     tool = Tool.read(data, given, frames, names=names, steps=steps, clock=clock, vertices=vertices)
     order = [step + given.points.rest for step in steps]
-    forces = read_force(data, given.force, given.points.files[0], rotation=given.frame.rotation, order=order)
+    forces = read_force(
+        data,
+        given.force,
+        given.points.files[0],
+        decimal=given.points.decimal,
+        rotation=given.frame.rotation,
+        order=order,
+    )
     name = identity(given.name, frames)
     truth = measured_truth(data, given, rest, mesh, name)
     skipped: list[tuple[str, str]] = []

@@ -1,5 +1,7 @@
 """The force on the tool of measured data: one row a frame, in the axes of the points."""
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,13 +12,18 @@ from ..errors import RecordingError
 from ..observation import MeasuredForce
 from ..recording.force import MAX_FORCE_N
 from ..toml_kinds import StrictTable
-from .data_folder import DataFolder
+from .data_folder import DataFolder, quoted
 from .points.archives import read_array
-from .points.text_lines import read_text
+from .points.text_lines import read_lines
+from .points.text_table import TextTable
 from .units import unit_of
 
 FORCE_UNITS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2}
 """Newtons in one unit of force."""
+AXIS = re.compile(r"(?:^|[\W_])(?:f|force)?[\W_]?([xyz])(?=$|[\W_])", re.IGNORECASE)
+"""An axis in a heading: Fx, force_x, F.x [mN]."""
+STATED = re.compile(r"[\[(]\s*(m?N|cN|kN|gf|kgf|lbf)\s*[\])]|[\s_](mN|cN|kN|gf|kgf|lbf)$")
+"""A unit of force in a heading or the name of an array: `Fx [N]`, `force_mN`. `force_n` may be a normal force."""
 TRACKED = ("on tool", "on tissue")
 """On which of the two the force acts."""
 
@@ -29,6 +36,8 @@ class GivenForce:
     """Name of the array (frames, 3) in the archive of the points; None where a file is given."""
     file: str | None
     """Text file of three columns, one row a frame; None where an array is given."""
+    unit: str
+    """Unit of the data, a key of `FORCE_UNITS`."""
     factor: float
     """Newtons in one unit of the data, negative where the force is that on the tissue."""
     sd: float | None
@@ -49,6 +58,7 @@ def read_force_table(table: StrictTable) -> GivenForce | None:
     force = GivenForce(
         values=table.take("values", kinds.text, None),
         file=table.take("file", kinds.text, None),
+        unit=table.take("unit", kinds.text, ""),
         factor=unit_of(table, "unit", FORCE_UNITS) * (1 if on == TRACKED[0] else -1),
         sd=table.take("sd", kinds.positive, None),
     )
@@ -63,6 +73,7 @@ def read_force(
     given: GivenForce | None,
     archive: str,
     *,
+    decimal: str | None,
     rotation: Float[np.ndarray, "3 3"],
     order: list[int],
 ) -> list[MeasuredForce | None]:
@@ -72,26 +83,35 @@ def read_force(
         folder: the data.
         given: what recording.toml says; None for no force.
         archive: name of the points' first file.
+        decimal: decimal mark of text files; None where it is to be found.
         rotation: from the axes of the data to those of the world.
         order: number of each frame in the data.
 
     Raises:
-        RecordingError: the array or file is missing or of another shape, or a force is of more than a tonne.
+        RecordingError: the array or file is missing or of another shape, its name or heading states another unit or
+            order of axes, or a force is of more than a tonne.
     """
     if given is None:
         return [None] * len(order)
     if given.values is not None:
         where, rows = f"{archive}: {given.values}", np.asarray(read_array(folder / archive, given.values))
+        _refuse_names(given, (given.values,), where)
     else:
         assert given.file is not None
-        where, rows = given.file, _rows(read_text(folder / given.file), given.file)
+        where = given.file
+        text = read_lines(folder / given.file)
+        table = TextTable.open(text, columns=None, given=(None, decimal), known=None)
+        _refuse_names(given, table.sample.names, where)
+        rows = table.read(range(table.width))
     if rows.shape != (len(order), 3) or rows.dtype.kind not in "iuf":
         raise RecordingError(
             f"{where} must be numbers of shape ({len(order)}, 3), a force x, y, z in each frame; it has {rows.shape}."
         )
-    force = given.factor * rows[order].astype(float) @ rotation.T
-    known = [bool(np.isfinite(row).all()) for row in force]
-    largest = float(np.abs(np.where(np.isfinite(force), force, 0.0)).max())
+    known = np.isfinite(rows[order].astype(float)).all(axis=1)
+    if not known.any():
+        raise RecordingError(f"{where} has no row of three finite numbers, so no frame has a force; leave out [force].")
+    force = given.factor * np.where(known[:, np.newaxis], rows[order], 0.0) @ rotation.T
+    largest = float(np.abs(force).max())
     if largest > MAX_FORCE_N:
         raise RecordingError(
             f"{where} has a force of {largest:.3g} N; at most {MAX_FORCE_N:g} N are read: is the "
@@ -100,22 +120,21 @@ def read_force(
     return [MeasuredForce(on_tool=force[k], sd=given.sd) if known[k] else None for k in range(len(force))]
 
 
-def _rows(text: str, where: str) -> Float[np.ndarray, "t c"]:
-    """Return the numbers of a text of columns, after a line of headings if there is one."""
-    lines = [line.replace(",", " ").replace(";", " ").split() for line in text.splitlines() if line.strip()]
-    if lines and not _is_numbers(lines[0]):
-        lines = lines[1:]
-    try:
-        return np.array([[float(cell) for cell in line] for line in lines])
-    except ValueError as failure:
+def _refuse_names(given: GivenForce, names: Sequence[str], where: str) -> None:
+    """Refuse headings, or the name of an array, that state another unit or another order of axes.
+
+    Raises:
+        RecordingError: they do.
+    """
+    units = {unit for name in names if (found := STATED.search(name.strip(' "'))) for unit in found.groups() if unit}
+    if units - {given.unit}:
+        stated = ", ".join(sorted(units - {given.unit}))
         raise RecordingError(
-            f"{where} must have three numbers a line, with decimal points, separated by commas: {str(failure)[:100]}."
-        ) from failure
-
-
-def _is_numbers(cells: list[str]) -> bool:
-    try:
-        [float(cell) for cell in cells]
-    except ValueError:
-        return False
-    return True
+            f'unit = "{given.unit}", but {where} says that forces are in {stated}: give that unit in [force], one of '
+            f"{', '.join(FORCE_UNITS)}, or rename it."
+        )
+    axes = [found[0].lower() if len(found := AXIS.findall(name.strip(' "'))) == 1 else None for name in names]
+    if len(names) == 3 and any(axis not in (None, wanted) for axis, wanted in zip(axes, "xyz", strict=True)):
+        raise RecordingError(
+            f"{where} has the heading '{quoted(', '.join(names))}'; its columns must be x, y and z in this order."
+        )
