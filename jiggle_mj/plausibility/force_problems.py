@@ -7,6 +7,7 @@ whole grasps, the sign is that of the other body. Which axes it has, the estimat
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from ..observation import MeasuredForce, ToolState
 from ..recording.reader import Recording
@@ -14,6 +15,10 @@ from .problem import RecordingProblem, warning
 
 DOUBTED_FORCE_N = 50.0
 """Largest change of the force on the tool that is no doubt [N]: tissue tears at less, and mN called N are beyond it."""
+MIN_FRAMES = 5
+"""Frames with a force from which a direction in which it never changes is doubted: three numbers of noise change."""
+SAME = 1e-9
+"""Share of the largest change of a force below which it does not change along a direction [1]: rounding."""
 GAINED_SHARE = 0.5
 """Share of the work, counted without its sign, that the tool may gain from the tissue [1]; noise gains 0 on average."""
 
@@ -21,7 +26,7 @@ GAINED_SHARE = 0.5
 def force_problems(
     recording: Recording, frames: Sequence[tuple[ToolState, MeasuredForce | None]]
 ) -> Iterator[RecordingProblem]:
-    """Find a force in an unknown frame, of an unlikely size, or of the opposite sign.
+    """Find a force in an unknown frame, of an unlikely size, of the opposite sign, or that lacks an axis.
 
     Args:
         recording: an open recording.
@@ -33,6 +38,7 @@ def force_problems(
             f"the force on the tool is not used: {recording.why_no_force} Give it in the world, in a frame that /tf "
             "joins to it, or in the frame '/tool/pose', the axes of the tool.",
         )
+    yield from _missing_axes([force.on_tool for _, force in frames if force is not None])
     offset, start, grasp = np.zeros(3), np.zeros(3), None
     work, unsigned, largest = 0.0, 0.0, 0.0
     for tool, force in frames:
@@ -53,4 +59,20 @@ def force_problems(
             "force-sign",
             "the force pulls the tool the way in which it moves; is it the force of the tissue on the tool, not that "
             "of the tool on the tissue?",
+        )
+
+
+def _missing_axes(forces: Sequence[Float[np.ndarray, " 3"]]) -> Iterator[RecordingProblem]:
+    """Find a force that never changes along one direction or more, as that of a sensor of one axis, or of one off."""
+    if len(forces) < MIN_FRAMES:
+        return
+    changes = np.linalg.svd(np.array(forces) - np.mean(forces, axis=0), compute_uv=False)
+    n_seen = int(np.sum(changes > SAME * max(changes[0], float(np.abs(forces).max()))))
+    if n_seen == 0:
+        yield warning("force-axes", "the force on the tool is the same in all frames; is the sensor on?")
+    elif n_seen < 3:
+        yield warning(
+            "force-axes",
+            f"the force on the tool changes along {n_seen} of three axes only, and counts as measured along all: record "
+            "all components, or leave the force out.",
         )

@@ -95,12 +95,16 @@ def test_a_force_that_is_none_is_refused():
         MeasuredForce(on_tool=ON_TOOL, sd=0.0)
 
 
+SENSOR_SD = 1e-4
+"""Noise of a component of the force [N]; the lifts pull with 0.2 N."""
+
+
 def lift(force) -> list[tuple[ToolState, MeasuredForce | None]]:
     """Return an open frame, then ten of a lift by 9 mm, with the force on the tool by the height [m]."""
-    closed, frames = replace(tool(), closed=True), []
+    closed, frames, noise = replace(tool(), closed=True), [], np.random.default_rng(0)
     for height in (None, *np.arange(10) * 1e-3):
         at = closed.position + np.array([0, 0, height or 0.0])
-        on_tool = np.array(force(height or 0.0), dtype=float)
+        on_tool = np.array(force(height or 0.0), dtype=float) + noise.normal(size=3) * SENSOR_SD
         frames.append((replace(closed, closed=height is not None, position=at), MeasuredForce(on_tool=on_tool)))
     return frames
 
@@ -117,3 +121,22 @@ def lift(force) -> list[tuple[ToolState, MeasuredForce | None]]:
 def test_a_force_that_does_negative_work_or_is_too_large_is_doubted(tmp_path, force, names):
     recording = recorded(tmp_path / "run.mcap", measured(0, "robot"))
     assert [problem.name for problem in force_problems(recording, lift(force))] == names
+
+
+@pytest.mark.parametrize(
+    ("measures", "words"),
+    [
+        ([0, 0, 0], "the same in all frames"),
+        ([0, 0, 1], "along 1 of three axes"),
+        ([1, 0, 1], "along 2 of three axes"),
+    ],
+)
+def test_a_force_without_all_axes_is_doubted_in_any_frame(tmp_path, measures, words):
+    R = Rotation.from_euler("xyz", [10, 20, 30], degrees=True)
+    frames = [
+        (tool, MeasuredForce(on_tool=R.apply(force.on_tool * measures + [0, 0.5, 0])))
+        for tool, force in lift(lambda z: [0.3, 0, 1 - 20 * z])
+        if force is not None
+    ]
+    (problem,) = force_problems(recorded(tmp_path / "run.mcap", measured(0, "robot")), frames)
+    assert problem.name == "force-axes" and words in problem.text
