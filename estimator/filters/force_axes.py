@@ -64,6 +64,8 @@ def doubt(
     )
     if best <= EXPLAINED * apart:
         return f"the measured force fits the sheet {_words(axes)}; {_cure(axes)}"
+    if factor > MAX_FACTOR and doubt(predicted, pull / factor, loads, sd, sd_given) is None:
+        return _wrong_unit(factor)  # it fits by its own unit's errors, which are not those of a force so large
     return (
         f"the measured force differs from what the sheet needs by {apart:.0%} of it, whatever its scale and axes; is "
         "it the force on the tool, without the tool's own weight, in the frame 'frame_id'?"

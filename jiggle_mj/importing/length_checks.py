@@ -53,6 +53,8 @@ def _lengths(given: MeasuredRecording, seen: Float[np.ndarray, "m 3"], steps: li
         yield _radius("[grasp]", grasp.path_radius)
         yield _place("[grasp] start", path.start, seen)
         yield "[grasp] step makes", abs(path.step) * max(map(abs, steps)), MAX_REACH
+    if given.smooth_length is not None:
+        yield "smooth_length is", given.smooth_length, MAX_REACH
     if given.margin is not None:
         yield from _of_margin(given.margin)
     if given.extension is not None:

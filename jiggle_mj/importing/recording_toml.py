@@ -164,6 +164,8 @@ def _noise(top: StrictTable) -> tuple[float, float, float | None]:
         return top.take("noise_sd", kinds.positive), 0.0, None
     if "noise_sd" in top.values:
         raise RecordingError(f"{top.where}: noise_sd is all noise together, and point_sd a part of it; give one.")
+    if "smooth_length" in top.values and "smooth_sd" not in top.values:
+        raise RecordingError(f"{top.where}: smooth_length needs smooth_sd, the noise that neighbours share over it.")
     point_sd, smooth_sd = top.take("point_sd", kinds.positive), top.take("smooth_sd", kinds.not_negative, 0.0)
     length = top.take("smooth_length", kinds.positive) if smooth_sd else top.take("smooth_length", kinds.positive, None)
     return math.hypot(point_sd, smooth_sd), smooth_sd, length

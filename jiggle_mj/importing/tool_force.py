@@ -101,7 +101,7 @@ def read_force(
         where = given.file
         text = read_lines(folder / given.file)
         table = TextTable.open(text, columns=None, given=(None, decimal), known=None)
-        _refuse_names(given, table.sample.names, where)
+        _refuse_names(given, table.sample.names, where, tuple(f"[{unit.strip('[]()')}]" for unit in table.sample.units))
         rows = table.read(range(table.width))
     if rows.shape != (len(order), 3) or rows.dtype.kind not in "iuf":
         raise RecordingError(
@@ -120,20 +120,21 @@ def read_force(
     return [MeasuredForce(on_tool=force[k], sd=given.sd) if known[k] else None for k in range(len(force))]
 
 
-def _refuse_names(given: GivenForce, names: Sequence[str], where: str) -> None:
+def _refuse_names(given: GivenForce, names: Sequence[str], where: str, units: Sequence[str] = ()) -> None:
     """Refuse headings, or the name of an array, that state another unit or another order of axes.
 
     Raises:
         RecordingError: they do.
     """
-    units = {unit for name in names if (found := STATED.search(name.strip(' "'))) for unit in found.groups() if unit}
-    if units - {given.unit}:
-        stated = ", ".join(sorted(units - {given.unit}))
+    found = [match for name in (*names, *units) if (match := STATED.search(name.strip(' "')))]
+    others = {unit for match in found for unit in match.groups() if unit} - {given.unit}
+    if others:
+        stated = ", ".join(sorted(others))
         raise RecordingError(
             f'unit = "{given.unit}", but {where} says that forces are in {stated}: give that unit in [force], one of '
             f"{', '.join(FORCE_UNITS)}, or rename it."
         )
-    axes = [found[0].lower() if len(found := AXIS.findall(name.strip(' "'))) == 1 else None for name in names]
+    axes = [each[0].lower() if len(each := AXIS.findall(name.strip(' "'))) == 1 else None for name in names]
     if len(names) == 3 and any(axis not in (None, wanted) for axis, wanted in zip(axes, "xyz", strict=True)):
         raise RecordingError(
             f"{where} has the heading '{quoted(', '.join(names))}'; its columns must be x, y and z in this order."

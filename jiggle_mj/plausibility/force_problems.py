@@ -73,6 +73,6 @@ def _missing_axes(forces: Sequence[Float[np.ndarray, " 3"]]) -> Iterator[Recordi
     elif n_seen < 3:
         yield warning(
             "force-axes",
-            f"the force on the tool changes along {n_seen} of three axes only, and counts as measured along all: record "
+            f"the force on the tool changes along {n_seen} of three axes only, and counts as measured in all: record "
             "all components, or leave the force out.",
         )

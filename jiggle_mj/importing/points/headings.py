@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Sequence
 
-UNIT_WORDS = frozenset("m mm cm um µm μm px pix pixel pixels s ms deg rad 1 - % none".split()) | {""}
+UNIT_WORDS = frozenset("m mm cm um µm μm px pix pixel pixels s ms n mn cn kn deg rad 1 - % none".split()) | {""}
 """What a line of units below a heading holds, without its brackets."""
 PIXELS = "pixels"
 """The unit of coordinates in an image, which are no lengths."""

@@ -142,6 +142,8 @@ def test_with_a_sure_declared_stiffness_the_force_halves_the_error_of_the_sum():
 PREDICTED = np.array([[0.02, 0.03, 0.1], [-0.04, 0.02, 0.2], [0.03, -0.05, 0.15], [-0.02, -0.03, 0.1]])
 LOADS = np.array([0.0, 0.0, 0.03])
 SD = np.full(PREDICTED.shape, 5e-3)
+ROUGH = np.array([[0.03, 0, 0.05], [0, 0.03, -0.05], [-0.03, 0, 0.05], [0, -0.03, -0.1]])
+"""Difference that errors of the model may make [N], where they are as large as the force."""
 DEAD_SENSOR = np.random.default_rng(0).normal(size=SD.shape) * SD
 
 
@@ -167,6 +169,14 @@ def test_a_force_of_another_sign_axes_or_unit_is_named(change, words):
     else:
         assert why is not None
         assert re.search(words, why), why
+
+
+def test_a_unit_is_named_where_the_model_errs_as_much_as_the_force():
+    """The errors of a sheet are in proportion to its force, so that mN called N are far outside of them."""
+    measured, sd = PREDICTED + ROUGH, np.full(SD.shape, 0.05)
+    assert doubt(PREDICTED, measured, 0 * SD, sd, sd) is None
+    why = doubt(PREDICTED, 1000 * measured, 0 * SD, sd, sd)
+    assert why is not None and "is it in mN" in why, why
 
 
 def test_no_force_is_not_doubted_where_none_is_expected():

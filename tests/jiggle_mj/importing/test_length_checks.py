@@ -22,6 +22,7 @@ ROWS, ATTACHED = "rows = [0, 1]", "attached_rows = [11, 12]\nattached_rows_first
         (ROWS, PULL.format(z=5e-3, step=1), "step makes 2 m"),
         (ROWS, PULL.format(z=5, step=1e-3), "start is away from the points by 4.995 m"),
         ("[grasp]", "[mesh]\nmargin = 5\n[grasp]", r"\[mesh\] margin is 5 m"),
+        ("noise_sd = 1e-4", "point_sd = 1e-4\nsmooth_sd = 1e-4\nsmooth_length = 10", "smooth_length is 10 m"),
         ("[grasp]", "[mesh]\nmargin = 5e-3\nspacing = 1\n[grasp]", r"\[mesh\] spacing is 1 m"),
         (
             "[grasp]",

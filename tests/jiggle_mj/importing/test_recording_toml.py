@@ -19,6 +19,7 @@ from tests.support.measured_folder import TOML, bring_in, folder
         ("noise_sd = 1e-4", "noise_sd = 1e-4\npoint_sd = 1e-4", "noise_sd is all noise together, and point_sd a part"),
         ("noise_sd = 1e-4", "noise_sd = 1e-4\nsmooth_sd = 1e-4", "smooth_sd needs point_sd"),
         ("noise_sd = 1e-4", "point_sd = 1e-4\nsmooth_sd = 1e-4", "lacks the key 'smooth_length'"),
+        ("noise_sd = 1e-4", "point_sd = 1e-4\nsmooth_length = 0.01", "smooth_length needs smooth_sd"),
         ("noise_sd = 1e-4", "point_sd = 1e-4\nsmooth_sd = -1", "smooth_sd must be a number"),
         ('files = ["rest.xyz", "pulled_*.xyz"]', 'file = ["rest.xyz"]', "lacks the key 'files'; did you write 'file'"),
         ("period = 0.5", "period = 0", "period must be a number above 0; got 0"),

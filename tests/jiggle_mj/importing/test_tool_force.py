@@ -34,10 +34,11 @@ def test_a_force_on_the_tissue_is_turned(tmp_path):
     "rows",
     [
         "Fx [mN];Fy [mN];Fz [mN]\n0,5;0,25;0,5\n10,5;20,25;30,5\n;;\n",
+        "Fx;Fy;Fz\nmN;mN;mN\n0,5;0,25;0,5\n10,5;20,25;30,5\nNA;NA;NA\n",
         "force_x\tforce_y\tforce_z\n0,5\t0,25\t0,5\n10,5\t20,25\t30,5\n\t\tNaN\n",
         "# Fx Fy Fz\n0.5 0.25 0.5\n10.5 20.25 30.5\ninf nan 1\n",
     ],
-    ids=["decimal-comma", "tabs", "blanks"],
+    ids=["decimal-comma", "line-of-units", "tabs", "blanks"],
 )
 def test_a_file_is_read_as_files_of_points_are(tmp_path, rows):
     _, second, third = imported(tmp_path, rows=rows)
@@ -55,6 +56,7 @@ def test_a_file_is_read_as_files_of_points_are(tmp_path, rows):
         (TABLE, "Fy;Fx;Fz\n0;0;0\n1;2;3\n1;2;3\n", "must be x, y and z in this order"),
         (TABLE, "fx,fz,fy\n0,0,0\n1,2,3\n1,2,3\n", "must be x, y and z in this order"),
         (TABLE, "Fx [N],Fy [N],Fz [N]\n0,0,0\n1,2,3\n1,2,3\n", "forces are in N: give that unit"),
+        (TABLE, "Fx,Fy,Fz\n[N],[N],[N]\n0,0,0\n1,2,3\n1,2,3\n", "forces are in N: give that unit"),
         (TABLE, "fx_gf fy_gf fz_gf\n0 0 0\n1 2 3\n1 2 3\n", "forces are in gf: give that unit"),
         (TABLE.replace("mN", "N"), "0 0 0\n1 1 1\n1 1 2e5\n", "at most 10000 N are read"),
         (TABLE.replace("mN", "kg"), ROWS, "unit must be one of N, mN, cN"),
