@@ -13,6 +13,9 @@ TOOL = "/tool/pose"
 MAX_FORCE_N = 1e4
 """Largest component of a force that is read [N]: a tonne. Tissue tears at a few N."""
 
+NO_TORQUE = (0.0, 0.0, 0.0)
+"""Torque in the message of an observation's force, which has none, and where a sensor gives none."""
+
 FORCE_SCHEMA: dict[str, object] = {
     "title": "jiggle_mj.Force",
     "type": "object",

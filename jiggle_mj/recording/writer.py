@@ -17,7 +17,7 @@ from ..errors import OptionError
 from ..observation import Declaration, MeasuredPoints, Observation
 from .declaration import METADATA, file_metadata, write_declaration
 from .events import EVENT_SCHEMA, event_json
-from .force import FORCE_SCHEMA, ToolForce, force_json
+from .force import FORCE_SCHEMA, NO_TORQUE, ToolForce, force_json
 from .frames import camera_transforms
 from .mcap_files import McapOutput
 from .schemas import (
@@ -30,9 +30,6 @@ from .schemas import (
     pose_message,
 )
 from .topics import EVENT, FORCE, GRASP, LEFT, LEFT_INFO, POINTS, POSE, RIGHT, RIGHT_INFO, TF
-
-NO_TORQUE = (0.0, 0.0, 0.0)
-"""Torque in the message of an observation's force, which has none."""
 
 
 class RecordingWriter:

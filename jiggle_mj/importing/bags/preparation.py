@@ -8,7 +8,7 @@ import numpy as np
 from ...camera import CameraCalibration, StereoCamera
 from ...errors import RecordingError
 from ...observation import Declaration, MeasuredPoints
-from ...recording.force import ToolForce
+from ...recording.force import NO_TORQUE, ToolForce
 from ...recording.schemas import WORLD
 from .bag_camera import bag_camera
 from .bag_file import Bag
@@ -213,11 +213,12 @@ def _forces(survey: BagSurvey, world: str, sd: float | None, notes: list[str]) -
     """Return the forces on the tool in the world; those whose frame /tf does not join to it keep their own."""
     if "force" not in survey.messages:
         return []
-    times, found, apart = survey.times["force"], [], Counter[str]()
+    times, found, apart, n_without = survey.times["force"], [], Counter[str](), 0
     for number in times.order:
         message, time = survey.messages["force"][number], times.stamps[number]
         force, torque = (np.array([each.x, each.y, each.z]) for each in (message.wrench.force, message.wrench.torque))
-        if not np.isfinite([force, torque]).all():
+        if not np.isfinite(force).all():
+            n_without += 1
             continue
         frame = frame_name(message.header.frame_id) or world
         try:
@@ -227,8 +228,11 @@ def _forces(survey: BagSurvey, world: str, sd: float | None, notes: list[str]) -
         else:
             frame = WORLD
         x, y, z = (rotation @ force).tolist()
-        u, v, w = (rotation @ torque).tolist()
+        # A sensor of forces alone may report torques of NaN; nothing is computed from them.
+        u, v, w = (rotation @ torque).tolist() if np.isfinite(torque).all() else NO_TORQUE
         found.append(ToolForce(time=time, force=(x, y, z), torque=(u, v, w), frame_id=frame, sd=sd))
+    if n_without:
+        notes.append(f"{times.topic}: {n_without} of {len(times.order)} forces are not finite, and are left out")
     for frame, count in apart.items():
         notes.append(
             f"{times.topic}: {count} forces are not used: /tf does not join '{frame}' to '{world}' at their time"

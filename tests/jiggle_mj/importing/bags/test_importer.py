@@ -323,6 +323,18 @@ def test_a_measured_force_is_turned_to_the_world(tmp_path: Path):
     )
 
 
+def test_forces_that_are_not_finite_are_counted_and_torques_are_not_needed(tmp_path: Path):
+    def force(made: RobotBag) -> None:
+        made.tf("/tf_static", 0, made.transform("world", "sensor", 0, np.eye(4)))
+        for index in range(7):
+            made.wrench("/tool/wrench", index * STEP // 2, [0, 0, np.nan if index == 0 else 0.5], [np.nan] * 3)
+
+    summary, recording = imported(bag(tmp_path, cameras, write_tool, write_images, force))
+    first, *others = [each.force for each in recording]
+    assert first is None and all(each is not None for each in others)
+    assert any("1 of 7 forces are not finite" in note for note in summary.notes)
+
+
 def test_without_tf_the_camera_is_the_world_and_gravity_unknown(tmp_path: Path):
     def infos(made: RobotBag) -> None:
         made.info("/left/camera_info", 0, small_camera().left)
