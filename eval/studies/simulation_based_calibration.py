@@ -168,7 +168,7 @@ def calibration_draw(scene: Scene, reference: CalibrationReference, seed: int) -
     belief, detection, attachments = estimator.belief, estimator.detection, estimator.attachment_belief
     with jax.enable_x64(True), one_thread():
         evidence = GaussianInformation(precision=attachments.precision, shift=attachments.shift)
-        key = jax.random.key(seed)
+        key = jax.random.key(seed % 2**32)  # larger ones are refused by JAX, and not by NumPy
         draws = np.asarray(posterior_draws(attachments.prior, evidence, key, count=DRAWS, thin=THIN))
         by_draws = quantities.by_draws(s, draws, rng)
         by_belief = quantities.by_belief(s, attachments, belief, rng)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from ..argument_checks import as_integer
+from ..errors import OptionError
 from ..options import CalibrationReference, Sensing
 from .options import Out, RowsName
 from .terminal import console, log
@@ -191,12 +193,18 @@ def _print_table(
         seeds: the study's own if None.
         jobs: processes, for a study that runs in parallel; one for each usable core if None.
         parallel: run in processes of their own.
+
+    Raises:
+        OptionError: no seed, or one below 0.
     """
     from jiggle_mj.eval.studies.study import run_study
 
     from ..worker_processes import WorkerProcesses
 
-    cells = study.cells(study.default_seeds if seeds is None else seeds)
+    if seeds == ():
+        raise OptionError("--seeds without a seed: give one or more, or leave it out.")
+    checked = study.default_seeds if seeds is None else [as_integer(seed, "--seeds", at_least=0) for seed in seeds]
+    cells = study.cells(checked)
     if parallel:
         with WorkerProcesses(jobs) as executor:
             results = run_study(study, cells, options.out, executor=executor, log=log)

@@ -222,6 +222,13 @@ def test_what_is_not_there_is_named_in_one_line(arguments, code, name, tmp_path,
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("seeds", "message"), [((), "--seeds without a seed"), ((0, -1), "--seeds = -1: must be")])
+def test_a_table_of_no_seeds_is_refused_before_it_begins(seeds, message, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "table"
+    assert call(monkeypatch, "table", "calibration", "--out", out, "--seeds", *seeds) == 2
+    assert message in capsys.readouterr().err and not out.exists()
+
+
 @pytest.mark.parametrize("arguments", [("nosuchverb",), ("run",), ("run", "arc", "--out", "x", "--sensing", "smell")])
 def test_bad_usage_exits_with_2(arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
