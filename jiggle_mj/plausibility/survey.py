@@ -13,6 +13,7 @@ from ..camera import StereoCamera
 from ..observation import MeasuredForce, ToolState
 from ..recording.reader import Recording
 from .closed_tool import NS, ClosedTool
+from .cloud_motion import CloudMotion
 from .declaration_problems import declaration_problems
 from .force_problems import force_problems
 from .grip_share import grip_share
@@ -111,7 +112,7 @@ def survey(recording: Recording) -> Survey:
     Args:
         recording: an open recording; iterating it anew afterwards begins at its first frame.
     """
-    motion, closed, times, track = PointMotion(), ClosedTool(), list[int](), HeldMotion()
+    motion, closed, times, track, cloud = PointMotion(), ClosedTool(), list[int](), HeldMotion(), CloudMotion()
     shares, distances, mesh = list[float](), list[float](), recording.declaration.mesh
     tools: list[tuple[int, ToolState]] = []
     forces: list[tuple[ToolState, MeasuredForce | None]] = []
@@ -141,6 +142,7 @@ def survey(recording: Recording) -> Survey:
                 still, compare = not closed.frames and not observation.tool.closed, len(times) % stride == 0
                 held = motion.add(points, observation.tool, still=still, compare=compare)
             first_cloud = points.positions if first_cloud is None else first_cloud
+        cloud.add(observation)
         closed.add(observation, held, motion.held_at_closing)
         track.add(observation, motion.held_at_closing + held, None if points is None else motion.positions)
     skipped = list(recording.skipped)
@@ -158,6 +160,7 @@ def survey(recording: Recording) -> Survey:
     why = None if closed.by_points else why_apart(track, noise_sd=sd)
     doubts = list[RecordingProblem]()
     doubts += point_problems(motion)
+    doubts += cloud.problems()
     if recording.declared:
         doubts += declaration_problems(recording.declaration, None if rest is None else extent(rest))
     if rest is not None:
