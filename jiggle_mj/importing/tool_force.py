@@ -107,7 +107,7 @@ def read_force(
         raise RecordingError(
             f"{where} must be numbers of shape ({len(order)}, 3), a force x, y, z in each frame; it has {rows.shape}."
         )
-    known = np.isfinite(rows[order].astype(float)).all(axis=1)
+    known = np.array([bool(np.isfinite(row).all()) for row in rows[order].astype(float)])
     if not known.any():
         raise RecordingError(f"{where} has no row of three finite numbers, so no frame has a force; leave out [force].")
     force = given.factor * np.where(known[:, np.newaxis], rows[order], 0.0) @ rotation.T
