@@ -45,9 +45,10 @@ def doubt(
         sd_given: the same with the attachments as they are believed; the sign shows by it, as no attachment pushes.
     """
     if not _is_significant(pull / sd_given):
+        factor = _apart(predicted, pull, loads, sd)[1]
         information = max(float(np.sum((predicted / sd) ** 2)), np.finfo(float).tiny)  # about the factor
-        if _apart(predicted, pull, loads, sd)[1] + FACTOR_ERRORS * information**-0.5 < 1 / MAX_FACTOR:
-            return DEAD
+        dead = factor + FACTOR_ERRORS * information**-0.5 < 1 / MAX_FACTOR
+        return DEAD if dead or _is_significant((pull - loads - factor * predicted) / sd) else None
     turned = -np.eye(3)
     apart, factor = _apart(predicted, pull, loads, sd_given)
     if apart > APART and _is_significant((pull - loads - factor * predicted) / sd_given):

@@ -179,6 +179,13 @@ def test_a_unit_is_named_where_the_model_errs_as_much_as_the_force():
     assert why is not None and "is it in mN" in why, why
 
 
+def test_a_dead_sensor_is_named_by_the_weight_that_it_does_not_show():
+    """The attachments are hardly known, and the sheet weighs 0.4 N."""
+    unsure, weight = np.full(SD.shape, 0.1), np.tile([0.0, 0.0, 0.4], (4, 1))
+    why = doubt(PREDICTED, np.zeros_like(SD), weight, unsure, SD)
+    assert why is not None and "is the sensor on" in why, why
+
+
 def test_no_force_is_not_doubted_where_none_is_expected():
     """Nothing holds the sheet, and it weighs nothing."""
     none = np.zeros_like(SD)
