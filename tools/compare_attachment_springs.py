@@ -22,12 +22,10 @@ from jiggle_mj.estimator.filters.force_balance import ForceBalance
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter, ImplicitState
 from jiggle_mj.estimator.tracked_sheet import TrackedSheet
 from jiggle_mj.eval.metrics.result_file import read_scorable
-from jiggle_mj.eval.metrics.truth_transfer import barycentric_weights, transfer
+from jiggle_mj.eval.metrics.truth_transfer import material_points, transfer
 
 SHARES = {1: 1 / 10, 2: 1 / 30, 3: 1 / 60}
 """Integral of three linear shape functions over a triangle of unit area, by the number of different corners."""
-SEEN_SD = 0.05
-"""Standard deviation from which a position counts as not seen [m]."""
 RANK = 1e-9
 """Smallest eigenvalue of a fit's matrix that counts [largest]."""
 
@@ -81,28 +79,26 @@ def main() -> None:
     chosen = np.flatnonzero(near)
     kinds = {"at particles": np.zeros((len(chosen), n, n)), "over triangles": consistent(rest, faces, chosen)}
     kinds["at particles"][np.arange(len(chosen)), chosen, chosen] = 1
-    corners, weights = barycentric_weights(rest, truth.rest, truth.faces)
-    moved = {}
-    for frame in truth.frames:
-        moved[frame.index] = np.einsum("mk,mkd->md", weights, (frame.positions - truth.rest)[corners])
+    at_material_points = material_points(rest, truth)
+    moved = {frame.index: at_material_points(frame.positions - truth.rest) for frame in truth.frames}
+    spread_b = np.linalg.lstsq(kinds["over triangles"].sum(axis=2).T, b, rcond=None)[0]
+    at = {"at particles": b[chosen], "over triangles": spread_b}
+    held = {kind: np.kron(np.einsum("k,kij->ij", at[kind], matrices), np.eye(3)) for kind, matrices in kinds.items()}
     fits = {(weighting, kind): [0.0, 0.0] for weighting in ("true positions", "as the filter") for kind in kinds}
-    for t, index in enumerate(estimate.index for estimate in found.estimates):
+    for t, estimate in enumerate(found.estimates):
         known = np.repeat(~frames.force_unknown[t], 3)
-        seen = np.trace(frames.precision[t], axis1=1, axis2=2) > 3 / SEEN_SD**2
-        for weighting in ("true positions", "as the filter"):
-            true = weighting == "true positions"
-            x = rest + moved[index] if true else frames.x[t]
+        seen = np.trace(frames.precision[t], axis1=1, axis2=2) > 0
+        innovation = np.where(seen[:, None], frames.y[t] - frames.x[t], 0.0).ravel()
+        noise, K = np.linalg.inv(frames.precision[t] + np.eye(3)), dense_dr_dx(balance, frames.x[t])
+        for weighting, x in (("true positions", rest + moved[estimate.index]), ("as the filter", frames.x[t])):
             force = np.asarray(balance.energy.internal_gradient(jnp.asarray(x))).ravel()
-            error = np.repeat(np.asarray(balance.error(jnp.asarray(x))) ** 2, 3)
+            variance = np.repeat(np.asarray(balance.error(jnp.asarray(x))) ** 2, 3)
             for kind, matrices in kinds.items():
-                spread, unbalanced = np.diag(error), force
-                if not true:
-                    at = b[chosen] if kind == "at particles" else np.linalg.lstsq(matrices.sum(2).T, b, rcond=None)[0]
-                    H = dense_dr_dx(balance, x) + np.kron(np.einsum("k,kij->ij", at, matrices), np.eye(3))
-                    noise = np.linalg.inv(frames.precision[t] + np.eye(3))
+                spread, unbalanced = np.diag(variance), force
+                if weighting == "as the filter":
+                    H = K + held[kind]
                     moves = np.einsum("mni,nij->mnj", H.reshape(3 * n, n, 3), noise).reshape(3 * n, 3 * n)
-                    spread = spread + moves @ H.T
-                    unbalanced = force + H @ np.where(seen[:, None], frames.y[t] - x, 0.0).ravel()
+                    spread, unbalanced = spread + moves @ H.T, force + H @ innovation
                 D = np.einsum("kij,jc->ick", matrices, x - rest).reshape(3 * n, -1)[known]
                 whitened = cho_solve(cho_factor(spread[np.ix_(known, known)], lower=True), D)
                 fit = fits[weighting, kind]

@@ -12,10 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from jiggle_mj.eval.metrics.result_file import read_scorable
-from jiggle_mj.eval.metrics.truth_transfer import barycentric_weights
+from jiggle_mj.eval.metrics.truth_transfer import material_points
 
-SEEN_SD = 0.05
-"""Standard deviation from which a position counts as not seen [m]."""
 DISTANCES = (1e-6, 6e-3, 1e-2, 1.5e-2, 2e-2)
 """Ends of the ranges of distance over which the correlation is averaged [m]."""
 
@@ -30,12 +28,9 @@ def main() -> None:
     frames, rest = found.frames, found.sheet.rest
     if frames is None:
         raise SystemExit("The estimate keeps no frames.")
-    corners, weights = barycentric_weights(rest, truth.rest, truth.faces)
-    positions = {frame.index: frame.positions for frame in truth.frames}
-    moved = np.array(
-        [np.einsum("mk,mkd->md", weights, (positions[each.index] - truth.rest)[corners]) for each in found.estimates]
-    )
-    seen = np.trace(frames.precision, axis1=2, axis2=3) > 3 / SEEN_SD**2
+    at_material_points, positions = material_points(rest, truth), {each.index: each.positions for each in truth.frames}
+    moved = np.array([at_material_points(positions[each.index] - truth.rest) for each in found.estimates])
+    seen = np.trace(frames.precision, axis1=2, axis2=3) > 0
     error = np.where(seen[..., None], frames.y - rest - moved, np.nan)
     stated = np.where(seen[..., None, None], np.linalg.inv(frames.precision + np.eye(3)), np.nan)
     print("error, rms [mm]        ", np.round(1e3 * np.sqrt(np.nanmean(error**2, axis=(0, 1))), 3))

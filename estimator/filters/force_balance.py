@@ -214,13 +214,6 @@ class ForceBalance(eqx.Module):
         fit = self.fit(frame := self.approach(x, s, evidence))
         return frame, fit, self.information(frame, fit)
 
-    def settled_evidence(
-        self, start: Float[Array, "n 3"], s: Float[Array, " n"], evidence: Evidence
-    ) -> tuple[Frame, FrameInformation]:
-        """Return a frame linearised near where the sheet settles from `start` [m], and its evidence about s."""
-        frame, _, information = self.evidence_near(self.settle(start, s, evidence), s, evidence)
-        return frame, information
-
     def polish(self, frame: Frame, s: Float[Array, " n"]) -> Float[Array, "n 3"]:
         """Return the state for another s [m], by one step with the frame's own factor."""
         return self._best_along(frame, self._state_step(frame, s), s)[0]

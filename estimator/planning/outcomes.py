@@ -3,7 +3,6 @@
 import math
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,16 +60,14 @@ def _batch_outcomes(
     predictor: PullPredictor, pulls: CandidatePull, s: Float[Array, "batch n"], *, informative: bool
 ) -> Outcome:
     """Return the outcome of each pull in its own scenario."""
-    arrays, static = eqx.partition(predictor, eqx.is_array)
     devices = jax.devices()[: math.gcd(BATCH, len(jax.devices()))]
 
-    def on_device(arrays: PullPredictor, pulls: CandidatePull, s: Float[Array, "share n"]) -> Outcome:
-        combined = eqx.combine(arrays, static)
-        return jax.vmap(lambda pull, scenario: _outcome(combined, pull, scenario, informative=informative))(pulls, s)
+    def on_device(predictor: PullPredictor, pulls: CandidatePull, s: Float[Array, "share n"]) -> Outcome:
+        return jax.vmap(lambda pull, scenario: _outcome(predictor, pull, scenario, informative=informative))(pulls, s)
 
     mesh, split, replicated = Mesh(np.array(devices), ("pairs",)), PartitionSpec("pairs"), PartitionSpec()
     sharded = jax.shard_map(on_device, mesh=mesh, in_specs=(replicated, split, split), out_specs=split, check_vma=False)
-    return sharded(arrays, pulls, s)
+    return sharded(predictor, pulls, s)
 
 
 def _outcome(

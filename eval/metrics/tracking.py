@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jiggle_mj.estimate import Estimate, Sheet
 from jiggle_mj.truth import Truth
 
-from .truth_transfer import barycentric_weights
+from .truth_transfer import material_points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +33,14 @@ class Tracking:
 def tracking(sheet: Sheet, estimates: Sequence[Estimate], truth: Truth) -> Tracking:
     """Return the errors of the particles seen in each frame, against the truth's frame of the same index."""
     frames = {frame.index: frame for frame in truth.frames}
-    corners, weights = barycentric_weights(sheet.rest, truth.rest, truth.faces)
+    at_material_points = material_points(sheet.rest, truth)
     squared, squared_estimate = [], []
     for estimate in estimates:
         if estimate.index not in frames:
             squared.append(np.empty(0))
             squared_estimate.append(np.empty(0))
             continue
-        true = np.einsum("mk,mkd->md", weights, frames[estimate.index].positions[corners])
+        true = at_material_points(frames[estimate.index].positions)
         seen = np.isfinite(true).all(axis=1) & np.isfinite(estimate.observed).all(axis=1)
         squared.append(np.sum((estimate.observed - true)[seen] ** 2, axis=1))
         squared_estimate.append(np.sum((estimate.positions - true)[seen] ** 2, axis=1))

@@ -11,6 +11,7 @@ patch has a part of the stiffness of one inside, and its free neighbour may have
 Positions follow barycentric interpolation in the reference's rest triangle nearest to the particle's rest position.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,6 +95,14 @@ def _longest_edge(sheet: Sheet) -> float:
     """Return the longest edge at rest [m]; infinite without triangles."""
     first, second = sheet.rest[edges(sheet.faces)].swapaxes(0, 1)
     return float(np.linalg.norm(first - second, axis=1).max(initial=0)) or np.inf
+
+
+def material_points(
+    rest: Float[np.ndarray, "m 3"], truth: Truth
+) -> Callable[[Float[np.ndarray, "v 3"]], Float[np.ndarray, "m 3"]]:
+    """Return the function that takes vectors at the reference's vertices to the material points nearest to `rest`."""
+    corners, weights = barycentric_weights(rest, truth.rest, truth.faces)
+    return lambda vectors: np.einsum("mk,mkd->md", weights, vectors[corners])
 
 
 def barycentric_weights(

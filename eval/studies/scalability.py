@@ -1,7 +1,6 @@
 """Study of how planning grows with the sheet: seconds for one action of the paper's SL-D and of ours, at each size.
 
-SL-D draws 100 samples in five iterations. Ours is `our_plan`. Compilation is not
-counted.
+SL-D draws 100 samples in five iterations. Ours is `our_plan`. Compilation is not counted.
 """
 
 import json

@@ -5,6 +5,8 @@ Single points cannot be followed in them. But a sheet that is lifted stays near 
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from ..observation import Observation
 from .point_motion import nearest_distance
 from .problem import RecordingProblem, metres, warning
@@ -31,7 +33,7 @@ class CloudMotion:
         if self._first is None or self._first.tool.grasp != tool.grasp:
             self._first = observation
             self._distances.append((0.0, distance, distance))
-        motion = float(sum((tool.position - self._first.tool.position) ** 2) ** 0.5)
+        motion = float(np.linalg.norm(tool.position - self._first.tool.position))
         most, at_first, _ = self._distances[-1]
         if motion > max(most, MIN_RADII * tool.radius):
             self._distances[-1] = motion, at_first, distance
