@@ -36,6 +36,11 @@ class Calibration:
     """Share of particles whose true stiffness lies in the central 90 % credible interval of its marginal."""
     coverage_attached: float | None
     """The same share among the truly attached alone: an interval from 0 holds every free one."""
+    nees_observable: float | None
+    """NEES per degree of freedom over the attached that bore an observable load. One that never moved is where the
+    prior puts it, and the few that are attached lie far out in a prior that calls most of them free."""
+    coverage_observable: float | None
+    """The same share among these."""
     ece: float | None
     """Expected calibration error of the probabilities of being attached."""
 
@@ -131,13 +136,24 @@ def calibration(
     stiffness: Float[np.ndarray, " n"],
     attached: Bool[np.ndarray, " n"],
     *,
+    observable: Bool[np.ndarray, " n"] | None = None,
     probability: Float[np.ndarray, " n"] | None = None,
 ) -> Calibration:
-    """Return all figures; `probability` is that of being attached, None for an estimator without one."""
+    """Return all figures.
+
+    Args:
+        belief: what is calibrated.
+        stiffness: b* [N/m].
+        attached: the truly attached particles.
+        observable: those of them that bore an observable load; None where loads are not known.
+        probability: that of being attached; None for an estimator without one.
+    """
     return Calibration(
         nees_per_dof=nees_per_dof(belief, stiffness),
         nees_attached=nees_per_dof(belief, stiffness, among=attached),
         coverage_90=coverage(belief, stiffness),
         coverage_attached=coverage(belief, stiffness, among=attached),
+        nees_observable=None if observable is None else nees_per_dof(belief, stiffness, among=observable),
+        coverage_observable=None if observable is None else coverage(belief, stiffness, among=observable),
         ece=None if probability is None else expected_calibration_error(probability, attached),
     )

@@ -147,7 +147,13 @@ def with_truth(
     """Return a copy of `unscored` with all figures that need the truth, which is taken at the last used frame."""
     transferred = transfer(sheet, truth, estimates[-1].index if estimates else 0)
     probability = detection.score if detection.probabilistic else None
-    calibrated = calibration(belief, transferred.stiffness, transferred.attached, probability=probability)
+    calibrated = calibration(
+        belief,
+        transferred.stiffness,
+        transferred.attached,
+        observable=transferred.observable,
+        probability=probability,
+    )
     scored = copy.deepcopy(unscored)
     _section(scored, "detection").update(
         n_detected=int(detection.attached.sum()),

@@ -18,7 +18,17 @@ KEYS = {
     },
     "noise": dict.fromkeys(("force_sd_ratio", "position_sd_ratio", "points")),
     "force": None,
-    "calibration": dict.fromkeys(("nees_per_dof", "nees_attached", "coverage_90", "coverage_attached", "ece")),
+    "calibration": dict.fromkeys(
+        (
+            "nees_per_dof",
+            "nees_attached",
+            "coverage_90",
+            "coverage_attached",
+            "nees_observable",
+            "coverage_observable",
+            "ece",
+        )
+    ),
     "tracking": {"rms_m": None},
     "safety": dict.fromkeys(
         ("limit_j", "max_mean_boundary_energy_j", "violations", "limit_n", "max_force_n", "force_violations")

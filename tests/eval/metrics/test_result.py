@@ -73,6 +73,8 @@ def test_the_truths_figures_by_hand():
         "nees_attached": pytest.approx(2.5),
         "coverage_90": pytest.approx(4 / 6),
         "coverage_attached": pytest.approx(1 / 2),
+        "nees_observable": None,
+        "coverage_observable": None,
         "ece": None,
     }
     assert figures["tracking"]["rms_m"] == pytest.approx(3e-4)
@@ -84,6 +86,15 @@ def test_the_truths_figures_by_hand():
         "max_force_n": None,
         "force_violations": None,
     }
+
+
+def test_attachments_that_bore_no_load_do_not_count_as_observable():
+    """Only 1 bore 3 mN, above 2.4: its error of -0.2 with a variance of 0.01 gives 4, outside of 90 %."""
+    frames = tuple(replace(frame, load=np.array([1e-3, 3e-3, 0, 0, 0, 0])) for frame in TRUTH.frames[-1:])
+    figures = scored(truth=replace(TRUTH, frames=frames))
+    assert figures["detection"]["n_observable"] == 1
+    assert figures["calibration"]["nees_observable"] == pytest.approx(4)
+    assert figures["calibration"]["coverage_observable"] == 0
 
 
 def test_frames_beyond_a_limit_are_counted():
