@@ -3,10 +3,14 @@
 Fit the declared model, score every effect by the residual, and refit with each of the likeliest. Some of these beat
 larger unexplained errors, have a plausible size and predict the held-out parts better. Keep the one with the largest
 log Bayes factor over the fourth root of its held-out error. Repeat for a second and a third effect.
+
+Effects with which the part that chose none is predicted worse are taken out again. What stays unexplained becomes a
+remainder without a name.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +21,7 @@ from .fit import MAX_STIFFNESS, Fitted, discounted, fit, start
 from .held_out import HeldOut, held_out, predict_held_out
 from .hypotheses import MAX_UNEXPLAINED_GAIN, FitContext, Hypothesis, leave_one_out
 from .problem import Problem
+from .remainder import FittedRemainder, remainder_of_fit
 from .search import MAX_EFFECTS, AddedHypothesis, Refused, following, revised
 from .unexplained_residual import unexplained_residual
 from .user_effects import check_effects
@@ -25,6 +30,15 @@ MAX_EXCESS = 5.0
 """Largest mean squared standardised residual of held-out parts with which the residual still counts as explained."""
 UNEXPLAINED = ("unexplained", "effect-with-remainder")
 """Verdicts with an unexplained residual."""
+
+
+class SearchStep(NamedTuple):
+    """A state of the search."""
+
+    added: list[AddedHypothesis]
+    """Effects in the model."""
+    context: FitContext
+    """The fit with them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +59,12 @@ class Closed:
     """The last fit. Where a residual is unexplained, its information is discounted by the mean squared standardised
     residual of held-out parts, so that fewer particles count as attached because of a cause without a name."""
     reported: tuple[HeldOut, HeldOut] | None
-    """Predictions, before and after, of a part that chose no effect; None if there was only one part."""
+    """Predictions, before and after, of a part that chose no effect; None if there was only one part. The error after
+    is never larger than before."""
+    remainder: FittedRemainder
+    """What the last fit does not explain."""
+    with_remainder: HeldOut | None
+    """Prediction of the same part with the remainder in it; None if there was only one part."""
     problem: Problem
     """What was fitted to."""
 
@@ -71,37 +90,26 @@ def close_the_loop(
     if dataset.left_out:
         log(f"{len(dataset.left_out)} frames excluded: the held particles are observed in another shape there")
     log(f"fitting {len(problem.frames(used))} frames in {len(used)} parts with the declared model")
-    contexts, added, refused, last_refused = (
-        [_declared(problem, dataset, used, log)],
-        list[AddedHypothesis](),
-        Refused(),
-        Refused(),
-    )
-    while len(added) < MAX_EFFECTS:
-        found, more = following(problem, contexts[-1], added, used, log)
-        if found is added:
-            last_refused = more
-            break
-        refused += more
-        added = found
-        contexts.append(added[-1].context)
-        log(f"effects so far: {', '.join(one.hypothesis.effect.name for one in added)}")
-    if len(added) > 1:
-        added = revised(problem, added, used, log)
-        contexts.append(added[-1].context)
+    steps, refused = _search(problem, _declared(problem, dataset, used, log), used, log)
+    predicted, most = list[HeldOut](), len(steps[-1].added)
+    if spare is not None:
+        predicted = [predict_held_out(problem, step.context.fitted, spare) for step in steps]
+        steps, predicted, dropped = carried_over(steps, predicted)
+        refused += dropped
+        for one, why in dropped:
+            log(f"{one.effect.name} taken out again: {why}")
+    added, contexts = steps[-1].added, [step.context for step in steps]
     accepted, names = [one.hypothesis for one in added], {one.hypothesis.effect.name for one in added}
     rivals = [[one for one in group.rivals if one.effect.name not in names] for group in added]
-    refused += [pair for group in added for pair in group.others] + last_refused
+    refused += [pair for group in added for pair in group.others]
     last_reasons = {one.effect.name: (one, why) for one, why in refused}
     named = names | {one.effect.name for group in rivals for one in group}
-    reported = None
-    if spare is not None:
-        before = predict_held_out(problem, contexts[0].fitted, spare)
-        reported = before, predict_held_out(problem, contexts[-1].fitted, spare) if accepted else before
     last = contexts[-1]
+    left = remainder_of_fit(problem, last.fitted)
+    with_remainder = None if spare is None else predicted[-1].beyond(*left.of(problem.history.frames, spare))
     folds = [HeldOut.together(last.folds)] if last.folds else []
-    predicted = folds + ([] if reported is None else [reported[1]])
-    unexplained = last.unexplained.gain > MAX_UNEXPLAINED_GAIN or any(one.excess > MAX_EXCESS for one in predicted)
+    unexplained = last.unexplained.gain > MAX_UNEXPLAINED_GAIN or len(accepted) < most
+    unexplained |= any(one.excess > MAX_EXCESS for one in folds + predicted[-1:])
     verdict, final = _verdict(accepted, rivals, unexplained), last.fitted
     if verdict in UNEXPLAINED and folds:
         excess = max(folds[0].excess, 1.0)
@@ -114,9 +122,44 @@ def close_the_loop(
         refused=[pair for name, pair in last_reasons.items() if name not in named],
         contexts=contexts,
         final=final,
-        reported=reported,
+        reported=(predicted[0], predicted[-1]) if predicted else None,
+        remainder=left,
+        with_remainder=with_remainder,
         problem=problem,
     )
+
+
+def _search(
+    problem: Problem, declared: FitContext, used: set[int], log: Callable[[str], None]
+) -> tuple[list[SearchStep], Refused]:
+    """Return the steps of the search, the first without effects, and the hypotheses that were refused beside them."""
+    steps, refused = [SearchStep([], declared)], Refused()
+    while len(steps[-1].added) < MAX_EFFECTS:
+        found, more = following(problem, steps[-1].context, steps[-1].added, used, log)
+        refused += more
+        if found is steps[-1].added:
+            break
+        steps.append(SearchStep(found, found[-1].context))
+        log(f"effects so far: {', '.join(one.hypothesis.effect.name for one in found)}")
+    if len(steps[-1].added) > 1:
+        added = revised(problem, steps[-1].added, used, log)
+        steps.append(SearchStep(added, added[-1].context))
+    return steps, refused
+
+
+def carried_over(steps: list[SearchStep], predicted: list[HeldOut]) -> tuple[list[SearchStep], list[HeldOut], Refused]:
+    """Return the steps up to the last one that predicts a part no worse than the first, and what is taken out again.
+
+    Args:
+        steps: effects in the model, and the fit with them.
+        predicted: prediction of the part by each.
+    """
+    last = max(k for k, one in enumerate(predicted) if not one.rms > predicted[0].rms)
+    kept = {one.hypothesis.effect.name for one in steps[last].added}
+    errors = f"{1e3 * predicted[-1].rms:.2f} mm with it and {1e3 * predicted[0].rms:.2f} mm with what is declared"
+    why = f"it did not carry over: the part that chose no effect is predicted to {errors}"
+    dropped = [(one.hypothesis, why) for one in steps[-1].added if one.hypothesis.effect.name not in kept]
+    return steps[: last + 1], predicted[: last + 1], dropped
 
 
 def _declared(problem: Problem, dataset: Dataset, used: set[int], log: Callable[[str], None]) -> FitContext:

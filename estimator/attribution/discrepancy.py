@@ -2,13 +2,12 @@
 
 from typing import Any
 
-from .baselines import in_proportion, unmoved
 from .close_loop import Closed
 from .dataset import Dataset
-from .held_out import HeldOut
 from .hypotheses import Hypothesis, reported_sd
 from .localisation import localisation
 from .suggestion import Suggestion
+from .trivial_predictions import trivial_predictions
 
 
 def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
@@ -47,8 +46,12 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
                 {"before_rms_m": before.rms, "after_rms_m": after.rms}
                 for before, after in zip(first.folds, last.folds, strict=True)
             ],
-            **_reported(closed.reported),
-            **_baselines(closed, dataset),
+            **_reported(closed),
+            **_trivial(closed, dataset),
+        },
+        "remainder": {
+            "degrees": closed.remainder.degrees,
+            **{f"{name}_sd_m": variance**0.5 for name, variance in closed.remainder.variances.items()},
         },
         "noise": {
             "sd_m": noise.sd,
@@ -80,13 +83,12 @@ def _effect(closed: Closed, one: Hypothesis, rivals: list[Hypothesis]) -> dict[s
     }
 
 
-def _baselines(closed: Closed, dataset: Dataset) -> dict[str, float | None]:
+def _trivial(closed: Closed, dataset: Dataset) -> dict[str, float | None]:
     """Return the errors without a model for the part that chose no effect."""
-    spare = None if closed.reported is None else dataset.frames[-1].part
-    return {
-        f"{name}_rms_m": None if spare is None else error(dataset.frames, spare)
-        for name, error in (("unmoved", unmoved), ("in_proportion", in_proportion))
-    }
+    if closed.reported is None:
+        return dict.fromkeys(("unmoved_rms_m", "last_frame_rms_m", "in_proportion_rms_m"))
+    errors = trivial_predictions(dataset.frames, dataset.frames[-1].part)
+    return {f"{name}_rms_m": error for name, error in errors.items()}
 
 
 def suggested(found: Suggestion) -> dict[str, Any]:
@@ -101,10 +103,11 @@ def suggested(found: Suggestion) -> dict[str, Any]:
     }
 
 
-def _reported(reported: tuple[HeldOut, HeldOut] | None) -> dict[str, float | None]:
+def _reported(closed: Closed) -> dict[str, float | None]:
     """Return the figures of the part that chose no effect; None without one."""
     figures: dict[str, float | None] = {}
-    for when, found in zip(("before", "after"), reported or (None, None), strict=True):
+    before, after = closed.reported or (None, None)
+    for when, found in (("before", before), ("after", after), ("with_remainder", closed.with_remainder)):
         figures[f"{when}_rms_m"] = None if found is None else found.rms
         figures[f"{when}_nll"] = None if found is None else found.nll
         figures[f"{when}_coverage_90"] = None if found is None else found.coverage_90

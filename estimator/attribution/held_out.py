@@ -25,18 +25,33 @@ HELD_STIFFNESS = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
+class Variances:
+    """Variances of the residuals of a held-out prediction, by their causes [m^2]."""
+
+    stiffness: Float[np.ndarray, "m 3"]
+    """Variance by what the fit leaves open of the stiffnesses."""
+    others: Float[np.ndarray, "m 3"]
+    """Variance by force errors of the model and the noise of observed positions; or by the remainder instead."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class HeldOut:
     """Held-out prediction of a part, for particles that are observed and not held."""
 
     residual: Float[np.ndarray, "m 3"]
     """Observed minus predicted positions [m]."""
-    compute_sd: Callable[[], Float[np.ndarray, "m 3"]]
-    """Function that computes `sd`, which costs more than all the rest."""
+    compute_variances: Callable[[], Variances]
+    """Function that computes `variances`, which costs more than all the rest."""
 
     @cached_property
+    def variances(self) -> Variances:
+        """Return the variances of the residual under the fit."""
+        return self.compute_variances()
+
+    @property
     def sd(self) -> Float[np.ndarray, "m 3"]:
         """Return the standard deviation of the residual under the fit [m]."""
-        return self.compute_sd()
+        return np.sqrt(self.variances.stiffness + self.variances.others)
 
     @property
     def rms(self) -> float:
@@ -58,12 +73,22 @@ class HeldOut:
         """Return the share of coordinates within their 90 % intervals."""
         return float(np.mean(np.abs(self.residual) <= norm.ppf(0.95) * self.sd))
 
+    def beyond(self, mean: Float[np.ndarray, "m 3"], variance: Float[np.ndarray, " m"]) -> "HeldOut":
+        """Return the prediction with a remainder of this mean [m] and variance [m^2], noise included, in it."""
+        return HeldOut(
+            residual=self.residual - mean,
+            compute_variances=lambda: replace(self.variances, others=np.repeat(variance[:, None], 3, axis=1)),
+        )
+
     @staticmethod
     def together(parts: list["HeldOut"]) -> "HeldOut":
         """Return the predictions of several parts as one."""
         return HeldOut(
             residual=np.concatenate([part.residual for part in parts]),
-            compute_sd=lambda: np.concatenate([part.sd for part in parts]),
+            compute_variances=lambda: Variances(
+                stiffness=np.concatenate([part.variances.stiffness for part in parts]),
+                others=np.concatenate([part.variances.others for part in parts]),
+            ),
         )
 
 
@@ -77,16 +102,26 @@ def predict_held_out(problem: Problem, fitted: Fitted, part: int) -> HeldOut:
     frames = problem.frames({part})
     predicted, closed = from_rest(problem, fitted.point, frames, by_tool=True), problem.history.frames
 
-    def sd() -> Float[np.ndarray, "m 3"]:
+    def variances() -> Variances:
         weights, known = weighed(problem, predicted, frames), _covariance(problem, fitted)
 
-        def one(k: int) -> Float[np.ndarray, "n 3"]:
-            return _sd(problem, weights[k], closed[k].frame, known, jnp.asarray(predicted.states[k]))
+        def one(k: int) -> Variances:
+            return _variances(problem, weights[k], closed[k].frame, known, jnp.asarray(predicted.states[k]))
 
         every = parallel_map(one, frames)
-        return np.concatenate([every[k][np.asarray(closed[k].frame.counted)] for k in frames])
+        counted = {k: np.asarray(closed[k].frame.counted) for k in frames}
+        return Variances(
+            stiffness=np.concatenate([every[k].stiffness[counted[k]] for k in frames]),
+            others=np.concatenate([every[k].others[counted[k]] for k in frames]),
+        )
 
-    return HeldOut(residual=residuals(problem, predicted, frames), compute_sd=sd)
+    return HeldOut(residual=residuals(problem, predicted, frames), compute_variances=variances)
+
+
+def noise_variance(problem: Problem, frame: ClosedFrame) -> Float[np.ndarray, " n"]:
+    """Return the variance of a coordinate of each particle by the noise of observed positions [m^2]."""
+    white = 1 / np.maximum(np.asarray(frame.precision)[:, 0, 0], 1.0)
+    return white + np.sum(problem.noise**2, axis=1)
 
 
 def residuals(problem: Problem, point: Point, frames: list[int]) -> Float[np.ndarray, "m 3"]:
@@ -127,10 +162,10 @@ def _covariance(problem: Problem, fitted: Fitted) -> Float[np.ndarray, "n n"]:
     return np.asarray(joint.with_independent("theta", problem.sd(fitted.named) ** -2).covariance("s"))
 
 
-def _sd(
+def _variances(
     problem: Problem, metric: Metric, seen: ClosedFrame, known: Float[np.ndarray, "n n"], x: Float[Array, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Return the sd of each observed coordinate [m]: from noise, force errors of the model, and the covariance of s."""
+) -> Variances:
+    """Return the variances of each observed coordinate; `known` is the covariance of s."""
     n, frame, held = len(x), metric.frame, np.asarray(seen.held)
     rows = np.zeros((n + 1, 3, n + 1, 3))
     neighbours = np.asarray(metric.balance.neighbours)
@@ -144,6 +179,7 @@ def _sd(
     slope = np.where(held[:, None], 0.0, np.asarray(frame.dr_ds))
     response = np.einsum("ani,ni->an", inverse.reshape(3 * n, n, 3), slope)
     unsure = np.sum((response @ known) * response, axis=1)
-    white = 1 / np.maximum(np.asarray(seen.precision)[:, 0, 0], 1.0)
-    noise = white + np.sum(problem.noise**2, axis=1)
-    return np.sqrt(wrong.reshape(n, 3) + np.maximum(unsure, 0).reshape(n, 3) + noise[:, None])
+    return Variances(
+        stiffness=np.maximum(unsure, 0).reshape(n, 3),
+        others=wrong.reshape(n, 3) + noise_variance(problem, seen)[:, None],
+    )

@@ -23,6 +23,14 @@ BEFORE, AFTER, RING = "#d55e00", "#0072b2", "#e8000b"
 """Colours of the figures before and after, and of the ring around an attached particle."""
 TIMES, LOCALISED = ("before", "after"), ("localisation", "localisation_after")
 """Keys of discrepancy.json for the two times."""
+WITHOUT_MODEL = "#999999"
+"""Colour of predictions without a model."""
+TRIVIAL = {
+    "unmoved": "nothing moves",
+    "last_frame": "the last frame stays",
+    "in_proportion": "each particle moves in proportion",
+}
+"""Predictions without a model, in words."""
 PAGE_HEIGHT = 1250
 """Height of all pictures [px]."""
 VERDICTS = {
@@ -78,12 +86,19 @@ def _held_out_sentences(found: Mapping[str, Any]) -> list[str]:
     numbers = f"{1e3 * held_out['before_rms_m']:.2f} mm"
     if found["effects"]:
         numbers += f" before, {1e3 * held_out['after_rms_m']:.2f} mm after"
-    still, shared = (f"{1e3 * held_out[f'{name}_rms_m']:.2f} mm" for name in ("unmoved", "in_proportion"))
-    return [
-        *sentences,
+    remainder, held = held_out["with_remainder_rms_m"], held_out["with_remainder_coverage_90"]
+    trivial = {words: held_out[f"{name}_rms_m"] for name, words in TRIVIAL.items()}
+    errors = [f"{1e3 * error:.2f} mm if {words}" for words, error in trivial.items()]
+    sentences += [
         f"The last part chose no effect; predicted from the tool's reports alone, its error is {numbers}.",
-        f"Without a model its error is {still} if nothing moves, and {shared} if each particle moves in proportion.",
+        f"With a remainder without a name, learned from the parts before, it is {1e3 * remainder:.2f} mm, and 90 % "
+        f"intervals hold {100 * held:.0f} %.",
+        f"Without a model it is {', '.join(errors[:-1])}, and {errors[-1]}.",
     ]
+    words, least = min(trivial.items(), key=lambda pair: pair[1])
+    if least < remainder:
+        sentences.append(f"That {words} predicts this part better than the model does: do not rely on its attachments.")
+    return sentences
 
 
 def _suggestion_sentence(suggestion: Mapping[str, Any]) -> str:
@@ -178,6 +193,11 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         labels = [f"held out {k + 1}" for k in range(len(errors) - 1)] + ["chose no effect"]
         bars = go.Bar(x=labels, y=[_in_mm(error) for error in errors], marker={"color": colour}, name=when,
                       showlegend=False)  # fmt: skip
+        figure.add_trace(bars, row=3, col=2)
+    if found["held_out"]["before_rms_m"] is not None:
+        others = {"with the remainder": "with_remainder"} | {words: name for name, words in TRIVIAL.items()}
+        bars = go.Bar(x=[*others], y=[_in_mm(found["held_out"][f"{name}_rms_m"]) for name in others.values()],
+                      marker={"color": [AFTER] + [WITHOUT_MODEL] * len(TRIVIAL)}, showlegend=False)  # fmt: skip
         figure.add_trace(bars, row=3, col=2)
     figure.update_layout(
         legend={"orientation": "h", "x": 0.62, "y": 0.685, "traceorder": "normal"},

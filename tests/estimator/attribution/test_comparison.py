@@ -1,13 +1,15 @@
 """Comparison of effects with each other and with none, by made-up numbers."""
 
 from dataclasses import replace
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
 
 from jiggle_mj.estimator.attribution import search
+from jiggle_mj.estimator.attribution.close_loop import SearchStep, carried_over
 from jiggle_mj.estimator.attribution.comparison import against, behind, best, indistinguishable, outdone
-from jiggle_mj.estimator.attribution.held_out import HeldOut
+from jiggle_mj.estimator.attribution.held_out import HeldOut, Variances
 from jiggle_mj.estimator.attribution.hypotheses import FitContext, Hypothesis, reported_sd
 from jiggle_mj.estimator.attribution.scores import Score
 from jiggle_mj.estimator.attribution.unexplained_residual import UnexplainedResidual
@@ -24,7 +26,10 @@ def ignore(message: str) -> None:
 def held_out(*errors_mm: float) -> list[HeldOut]:
     """Return the predictions of parts with the given errors."""
     return [
-        HeldOut(residual=np.array([[1e-3 * error, 0.0, 0.0]]), compute_sd=lambda: np.ones((1, 3)))
+        HeldOut(
+            residual=np.array([[1e-3 * error, 0.0, 0.0]]),
+            compute_variances=lambda: Variances(stiffness=np.zeros((1, 3)), others=np.ones((1, 3))),
+        )
         for error in errors_mm
     ]
 
@@ -232,3 +237,19 @@ def test_the_reported_sd_is_that_of_one_part_and_of_the_nuisance_parameter():
     one = hypothesis("bed", 300.0, 0.5, 0.5, 0.5, 0.5)
     one = replace(one, fitted=fitted, sds=np.array([0.1, 0.2, 0.3, 0.4]))
     np.testing.assert_allclose(reported_sd(problem, one), [0.2, 0.5, 0.6])
+
+
+def test_effects_that_predict_the_reported_part_worse_are_taken_out_again():
+    """Two effects: the first improves the part that chose none from 4.8 to 4.0 mm, the second makes it 6.6 mm."""
+    first, second = (
+        search.AddedHypothesis(hypothesis=hypothesis(name, 100.0, 0.5), rivals=[], others=[])
+        for name in ("gravity", "bed")
+    )
+    steps = [SearchStep([], context()), SearchStep([first], context()), SearchStep([first, second], context())]
+    kept, predicted, dropped = carried_over(steps, held_out(4.8, 4.0, 6.6))
+    assert kept == steps[:2] and [1e3 * one.rms for one in predicted] == pytest.approx([4.8, 4.0])
+    ((one, why),) = dropped
+    assert one is second.hypothesis
+    assert why.endswith("predicted to 6.60 mm with it and 4.80 mm with what is declared")
+    assert carried_over(steps, held_out(4.8, 4.9, 6.6))[0] == steps[:1]
+    assert carried_over(steps, held_out(4.8, 4.9, 4.7)) == (steps, ANY, [])

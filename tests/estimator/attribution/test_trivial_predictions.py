@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.attribution.baselines import in_proportion, unmoved
+from jiggle_mj.estimator.attribution.trivial_predictions import trivial_predictions
 from tests.support.small_sheet import sheet
 
 ERROR = 5e-4
@@ -29,7 +29,12 @@ def test_baselines_of_particles_that_move_a_share_of_the_tools_displacement(ligh
     ]
     of_part = [one for one in frames if one.part == last]
     moved = np.mean([bool(np.any(one.frame.displacement)) for one in of_part])
-    assert in_proportion(frames, last) == pytest.approx(ERROR * np.sqrt(moved))
+    found = trivial_predictions(frames, last)
+    assert found["in_proportion"] == pytest.approx(ERROR * np.sqrt(moved))
     free = ~np.asarray(of_part[0].frame.held)
     displacement = np.concatenate([(np.asarray(one.frame.y) - rest)[free] for one in of_part])
-    assert unmoved(frames, last) == pytest.approx(np.sqrt(np.mean(np.sum(displacement**2, axis=1))))
+    assert found["unmoved"] == pytest.approx(np.sqrt(np.mean(np.sum(displacement**2, axis=1))))
+    before = [one for one in frames if one.part != last][-1].frame
+    both = free & ~np.asarray(before.held)
+    changed = np.concatenate([(np.asarray(one.frame.y) - np.asarray(before.y))[both] for one in of_part])
+    assert found["last_frame"] == pytest.approx(np.sqrt(np.mean(np.sum(changed**2, axis=1))))
