@@ -41,8 +41,6 @@ class TrackedSheet:
     """Positions after the latest frame with closed jaws, at first at rest [m]."""
     open_x: Float[np.ndarray, "n 3"]
     """Positions with open jaws when they were last asked for, at first at rest [m]."""
-    stiffness_scale: StiffnessScale | None = None
-    """The factor that the tool's force put on all stiffnesses at the last refinement; None for 1."""
 
     @classmethod
     def build(
@@ -72,15 +70,25 @@ class TrackedSheet:
         noise = self.filter.noise(self.state)
         return 1.0 if noise is None else noise.position
 
+    @property
+    def stiffness_scale(self) -> StiffnessScale | None:
+        """The factor that the tool's force puts on all stiffnesses of the present belief; None for 1.
+
+        It is not kept from a refinement on: what later frames show of the attachments shows it as well.
+        """
+        fit, belief = self.filter.force(self.state), self.state.summary.belief
+        if fit is None or isinstance(belief, GaussianBelief):
+            return None
+        with jax.enable_x64(True):
+            return fit.scale(belief)
+
     def take(self, state: FilterState, summary: PosteriorSummary | None) -> None:
-        """Take the state after a refinement, and the factor that the tool's force puts on all stiffnesses then.
+        """Take the state after a refinement.
 
         Raises:
             PerceptionError: the posterior of the refinement is not finite; the state keeps the belief of before.
         """
         self.state = state
-        fit, belief = self.filter.force(state), state.summary.belief
-        self.stiffness_scale = None if fit is None or isinstance(belief, GaussianBelief) else fit.scale(belief)
         refuse_not_finite(summary)
 
 

@@ -254,6 +254,7 @@ class AttachmentBelief(eqx.Module):
             entropy=gaussian.entropy(),
         )
 
+    @eqx.filter_jit
     def moments(self) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
         """Return mean and covariance of s, with what the mesh adds to it.
 

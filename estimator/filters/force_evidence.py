@@ -3,7 +3,7 @@
 Positions give stiffnesses relative to the declared membrane stiffness. Where that is off by a factor c, so are all
 elastic forces and every b. With `FrameForce` for the other symbols,
 
-    L = P - loads = c E(s) + n,    n ~ N(0, V_L + c^2 V),    log c ~ N(0, sd^2).
+    L = P - loads = c E(s) + n,    n ~ N(0, V_L + c^2 V),    log c ~ N(mean, sd^2).
 
 E is the expected force given what was seen, so its error does not bias c, which that of L as a regressor would [Berkson
 1950, doi:10.1080/01621459.1950.10483349]. Linearised at s and log c, frames add up in information form over both.
@@ -13,6 +13,7 @@ Log c is marginalised for the belief over s; given s it is normal.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -62,6 +63,15 @@ class StackedForces:
         return self.load_covariance + factor**2 * self.model_covariance
 
 
+class LogFactor(eqx.Module):
+    """Normal distribution of log c."""
+
+    sd: float
+    """Standard deviation [nat]."""
+    mean: float = 0.0
+    """Mean [nat]; 0 is as declared."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ForceEvidence:
     """Evidence about (s, log c) in information form."""
@@ -78,14 +88,16 @@ class ForceEvidence:
     """Information of log c."""
 
     @classmethod
-    def of(cls, forces: StackedForces, s: Float[np.ndarray, " n"], log_factor: float, *, sd: float) -> "ForceEvidence":
+    def of(
+        cls, forces: StackedForces, s: Float[np.ndarray, " n"], log_factor: float, *, before: "LogFactor"
+    ) -> "ForceEvidence":
         """Linearise the forces at s and log c.
 
         Args:
             forces: of all frames.
             s: bounded stiffnesses [1].
             log_factor: log c [nat].
-            sd: standard deviation of log c before any force [nat].
+            before: log c before these forces.
         """
         factor = np.exp(log_factor)
         root = np.linalg.inv(np.linalg.cholesky(forces.covariance(factor)))
@@ -98,10 +110,16 @@ class ForceEvidence:
         return cls(
             precision=J.T @ J,
             cross=J.T @ by_log,
-            own=float(by_log @ by_log) + sd**-2,
+            own=float(by_log @ by_log) + before.sd**-2,
             shift=J.T @ target,
-            own_shift=float(by_log @ target),
+            own_shift=float(by_log @ target) + before.mean * before.sd**-2,
         )
+
+    @classmethod
+    def of_factor(cls, known: LogFactor, n: int) -> "ForceEvidence":
+        """Return evidence about log c alone, and nothing about n stiffnesses."""
+        nothing, own = np.zeros(n), known.sd**-2
+        return cls(precision=np.zeros((n, n)), cross=nothing, own=own, shift=nothing, own_shift=known.mean * own)
 
     @property
     def marginal(self) -> GaussianInformation:
@@ -121,7 +139,7 @@ class ForceEvidence:
 
 
 def fitted(
-    forces: StackedForces, precision: Float[np.ndarray, "n n"], shift: Float[np.ndarray, " n"], *, sd: float
+    forces: StackedForces, precision: Float[np.ndarray, "n n"], shift: Float[np.ndarray, " n"], *, before: LogFactor
 ) -> tuple[ForceEvidence, float]:
     """Return the evidence of forces, linearised where it and all else agree best, and log c there.
 
@@ -129,17 +147,17 @@ def fitted(
         forces: of all frames.
         precision: precision of s by all else.
         shift: information vector of s by all else.
-        sd: standard deviation of log c before any force [nat].
+        before: log c before these forces.
     """
-    s, log_factor = np.linalg.solve(precision, shift), 0.0
-    evidence = ForceEvidence.of(forces, s, log_factor, sd=sd)
+    s, log_factor = np.linalg.solve(precision, shift), before.mean
+    evidence = ForceEvidence.of(forces, s, log_factor, before=before)
     for _ in range(STEPS):
         marginal = evidence.marginal
         s = np.linalg.solve(precision + marginal.precision, shift + marginal.shift)
         found = (evidence.own_shift - evidence.cross @ s) / evidence.own
         step = np.clip(found - log_factor, -MAX_STEP, MAX_STEP)
         log_factor = float(np.clip(log_factor + step, -MAX_LOG_FACTOR, MAX_LOG_FACTOR))
-        evidence = ForceEvidence.of(forces, s, log_factor, sd=sd)
+        evidence = ForceEvidence.of(forces, s, log_factor, before=before)
     return evidence, log_factor
 
 

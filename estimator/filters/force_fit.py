@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from ..belief.attachment_belief import AttachmentBelief
 from .force_axes import doubt
-from .force_evidence import ForceEvidence, StackedForces, fitted, innovations
+from .force_evidence import ForceEvidence, LogFactor, StackedForces, fitted, innovations
 from .tool_force import FrameForce
 
 NO_NOISE = (
@@ -60,17 +60,19 @@ class ForceFit(eqx.Module):
     """The same at the factor that fits best [1]."""
     doubt: str | None
     """Why the force is not used; None where it is."""
+    before: LogFactor
+    """Logarithm of the factor before these forces."""
     evidence: ForceEvidence | None
     """Evidence about s and the factor; None where the force is not used."""
 
     @classmethod
-    def of(cls, frames: Sequence[FrameForce], belief: AttachmentBelief, *, sd: float) -> "ForceFit":
+    def of(cls, frames: Sequence[FrameForce], belief: AttachmentBelief, *, before: LogFactor) -> "ForceFit":
         """Compare the forces of frames with a belief that does not hold them.
 
         Args:
             frames: at least one.
             belief: by the shape alone.
-            sd: standard deviation of the logarithm of the factor on it before any force [nat].
+            before: logarithm of the factor on all stiffnesses before these forces.
         """
         forces = StackedForces.of(frames)
         known = bool(np.isfinite(forces.load_covariance).all())
@@ -83,7 +85,7 @@ class ForceFit(eqx.Module):
         difference, spread = innovations(forces, mean, covariance, factor=1.0)
         sds, given = (np.sqrt(np.diagonal(part, axis1=1, axis2=2)) for part in (spread, forces.covariance(1.0)))
         why = doubt(forces.elastic(mean), forces.pull, forces.loads, sds, given) or (None if known else NO_NOISE)
-        evidence, log_factor = fitted(forces, precision, shift, sd=sd)
+        evidence, log_factor = fitted(forces, precision, shift, before=before)
         return cls(
             index=np.array([frame.index for frame in frames]),
             measured=-forces.pull,
@@ -92,8 +94,21 @@ class ForceFit(eqx.Module):
             nis=_nis(difference, spread),
             scaled_nis=_nis(*innovations(forces, mean, covariance, factor=np.exp(log_factor))),
             doubt=why,
+            before=before,
             evidence=evidence if why is None else None,
         )
+
+    def changed(self, belief: AttachmentBelief) -> "ForceFit":
+        """Return the fit after a cut or suture: the factor is known as before, whatever becomes of the attachments.
+
+        Args:
+            belief: before the cut or suture, with the evidence.
+        """
+        if self.evidence is None:
+            return self
+        mean, sd, _ = self.evidence.given(*(np.asarray(part) for part in belief.moments()))
+        known = LogFactor(mean=mean, sd=sd)
+        return replace(self, before=known, evidence=ForceEvidence.of_factor(known, len(belief.shift)))
 
     def scale(self, belief: AttachmentBelief) -> StiffnessScale | None:
         """Return the factor on all stiffnesses for a posterior that holds the evidence; None where it says nothing."""

@@ -27,6 +27,7 @@ from .config import FilterConfig, SamplingConfig
 from .evidence import Evidence
 from .filter import FilterState, ForceBalanceFilter, Region
 from .force_balance import ForceBalance
+from .force_evidence import LogFactor
 from .force_fit import ForceFit
 from .frame import FrameInformation
 from .grasp import GraspFrames
@@ -159,9 +160,8 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
 
     def change(self, state: ImplicitState, event: Cut | Suture, *, region: Region, index: int) -> ImplicitState:
         """See `Filter.change`; the next frame begins another grasp, and no frame from before is linearised again."""
-        changes = state.changes
-        if changes:
-            changes = (*changes[:-1], replace(changes[-1], evidence=state.evidence))
+        changes = tuple(replace(change, evidence=state.evidence) for change in state.changes[-1:])
+        changes = (*state.changes[:-1], *changes)
         belief = after(state.belief, event, region)
         return replace(
             state,
@@ -171,6 +171,7 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
             earlier_precision=belief.precision,
             earlier_shift=belief.shift,
             between_grasps=True,
+            force=None if state.force is None else state.force.changed(state.belief),
         )
 
     def log_bayes_factor(self, state: ImplicitState, change: Change) -> float | None:
@@ -285,7 +286,8 @@ class ImplicitFilter(ForceBalanceFilter[ImplicitState]):
         frames = [frame for grasp in state.grasps for frame in grasp.forces]
         if not frames:
             return state, belief
-        fit = ForceFit.of(frames, belief, sd=self.config.declared_stiffness_sd)
+        before = LogFactor(sd=self.config.declared_stiffness_sd) if state.force is None else state.force.before
+        fit = ForceFit.of(frames, belief, before=before)
         if fit.evidence is not None:
             marginal = fit.evidence.marginal
             belief = belief.add(jnp.asarray(marginal.precision), jnp.asarray(marginal.shift))
@@ -394,6 +396,5 @@ def _normalised_innovation(information: FrameInformation, gaussian: Gaussian, ev
     the middle matrix as its covariance.
     """
     explained = information.score @ gaussian.solve(information.score)
-    observed = jnp.sum(evidence.directions)
-    degrees = jnp.maximum(observed - 3 * jnp.sum(evidence.force_unknown), 1)
+    degrees = jnp.maximum(jnp.sum(evidence.directions) - 3 * jnp.sum(evidence.force_unknown), 1)
     return (information.chi2 - explained) / degrees.astype(explained.dtype)

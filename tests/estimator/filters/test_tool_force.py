@@ -8,13 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jiggle_mj.actions import Cut
+from jiggle_mj.estimate import Sheet
+from jiggle_mj.estimator import summaries
+from jiggle_mj.estimator.belief.topology import region_of
 from jiggle_mj.estimator.filters.config import FilterConfig
 from jiggle_mj.estimator.filters.evidence import Evidence, MeasuredPull
 from jiggle_mj.estimator.filters.force_axes import doubt
-from jiggle_mj.estimator.filters.force_evidence import ForceEvidence, StackedForces, fitted
+from jiggle_mj.estimator.filters.force_evidence import ForceEvidence, LogFactor, StackedForces, fitted
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
 from jiggle_mj.estimator.filters.tool_force import FrameForce, frame_force
+from jiggle_mj.estimator.perception.mesh_field import MeshField
 from jiggle_mj.estimator.physics.surrogate import surrogate
+from jiggle_mj.estimator.tracked_sheet import TrackedSheet
 from jiggle_mj.observation import Declaration
 from tests.support.small_sheet import (
     DECLARATION,
@@ -124,7 +130,7 @@ def test_the_factor_on_a_declared_stiffness_is_found_within_its_error(factor):
         forces, s = synthetic(factor, 0.3, seed)
         precision, rng = np.eye(len(s)) / 0.02**2, np.random.default_rng(seed + 1000)
         shift = precision @ (s + 0.02 * rng.normal(size=len(s)))
-        evidence, _ = fitted(forces, precision, shift, sd=2.0)
+        evidence, _ = fitted(forces, precision, shift, before=LogFactor(sd=2.0))
         covariance = np.linalg.inv(precision + evidence.marginal.precision)
         log_factor, sd, _ = evidence.given(covariance @ (shift + evidence.marginal.shift), covariance)
         scores.append((log_factor - np.log(factor)) / sd)
@@ -134,7 +140,7 @@ def test_the_factor_on_a_declared_stiffness_is_found_within_its_error(factor):
 def test_with_a_sure_declared_stiffness_the_force_halves_the_error_of_the_sum():
     forces, s = synthetic(1.0, 0.3)
     precision = np.eye(len(s)) / 0.02**2
-    marginal = ForceEvidence.of(forces, s, 0.0, sd=0.01).marginal
+    marginal = ForceEvidence.of(forces, s, 0.0, before=LogFactor(sd=0.01)).marginal
     before, after = (np.sum(np.linalg.inv(p)) ** 0.5 for p in (precision, precision + marginal.precision))
     assert after < 0.5 * before
 
@@ -224,6 +230,43 @@ def test_a_grasp_gives_its_force_to_the_belief_but_not_with_the_wrong_sign(sign,
     else:
         assert fit.evidence is None and fit.scale(summary.belief) is None
         assert fit.doubt is not None and words in fit.doubt
+
+
+EXACT_FORCE_SD = 1e-5
+"""Noise of a sensor by which the factor and the stiffnesses are nearly one unknown [N]."""
+
+
+@pytest.fixture(scope="module")
+def tracked() -> TrackedSheet:
+    """Return a sheet after two lifts with nearly exact forces, released."""
+    filter, b, first = filter_of(K), STIFFNESS * attached(), lifts()[:8]
+    seen = [with_force(observed(lift, k), pull_of(lift, b), EXACT_FORCE_SD, k) for k, lift in enumerate(first)]
+    state, *_ = follow(filter, first, seen)
+    rest, field = sheet().rest, MeshField(sheet().rest[:, :2], sheet().faces)
+    parts = Sheet(rest=rest, faces=sheet().faces)
+    return TrackedSheet(sheet=parts, filter=filter, field=field, prior_entropy=0.0, state=state, x=rest, open_x=rest)
+
+
+def test_between_releases_the_factor_is_that_of_the_present_belief(tracked):
+    """Frames without a force narrow the stiffnesses, and with them the factor: the covariance stays one."""
+    state, frames = tracked.state, lifts()[8:12]
+    for k, lift in enumerate(frames, start=8):
+        state, _ = tracked.filter.update(state, observed(lift, k), jnp.asarray(observed(lift, k).y))
+    later = replace(tracked, state=state)
+    assert later.stiffness_scale is not None
+    assert np.linalg.eigvalsh(summaries.belief(state.summary, later.stiffness_scale).covariance).min() > 0
+
+
+def test_a_cut_leaves_the_factor_as_it_was_known(tracked):
+    """The tool pulled at the attachments of before, so that fewer of them make the sheet no stiffer."""
+    cut = Cut(path=np.array([[-0.02, 0.006], [0.02, 0.006]]), width=0.016)
+    region = region_of(cut, sheet().rest)
+    assert (region & attached()).sum() > attached().sum() / 2
+    state = tracked.filter.change(tracked.state, cut, region=region, index=8)
+    before, after = tracked.stiffness_scale, replace(tracked, state=state).stiffness_scale
+    assert before is not None and after is not None
+    assert (after.factor, after.log_sd) == pytest.approx((before.factor, before.log_sd))
+    assert not after.log_with_s.any()
 
 
 @pytest.mark.slow
