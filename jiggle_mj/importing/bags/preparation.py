@@ -210,21 +210,24 @@ def _jaws(
 
 
 def _forces(survey: BagSurvey, world: str, sd: float | None, notes: list[str]) -> list[ToolForce]:
-    """Return the forces on the tool in the world; those whose frame /tf does not join to it keep their own."""
+    """Return the forces on the tool in the world, without those whose frame /tf does not join to it at their time.
+
+    Where it joins none, all keep their frame, by which a reader says why they are not used.
+    """
     if "force" not in survey.messages:
         return []
-    times, found, apart, n_without = survey.times["force"], [], Counter[str](), 0
+    times, joined, apart, n_without = survey.times["force"], list[ToolForce](), list[ToolForce](), 0
     for number in times.order:
         message, time = survey.messages["force"][number], times.stamps[number]
         force, torque = (np.array([each.x, each.y, each.z]) for each in (message.wrench.force, message.wrench.torque))
         if not np.isfinite(force).all():
             n_without += 1
             continue
-        frame = frame_name(message.header.frame_id) or world
+        frame, found = frame_name(message.header.frame_id) or world, joined
         try:
             rotation = survey.tree.T_world(frame, world, time, times.topic)[:3, :3]
         except RecordingError:
-            rotation, apart[frame] = np.eye(3), apart[frame] + 1
+            rotation, found = np.eye(3), apart
         else:
             frame = WORLD
         x, y, z = (rotation @ force).tolist()
@@ -233,8 +236,9 @@ def _forces(survey: BagSurvey, world: str, sd: float | None, notes: list[str]) -
         found.append(ToolForce(time=time, force=(x, y, z), torque=(u, v, w), frame_id=frame, sd=sd))
     if n_without:
         notes.append(f"{times.topic}: {n_without} of {len(times.order)} forces are not finite, and are left out")
-    for frame, count in apart.items():
+    for frame, count in Counter(force.frame_id for force in apart).items():
         notes.append(
             f"{times.topic}: {count} forces are not used: /tf does not join '{frame}' to '{world}' at their time"
         )
-    return found
+    # A frame of the bag that has the name of a recording's world would be taken for it.
+    return joined or [force for force in apart if force.frame_id != WORLD]

@@ -323,6 +323,23 @@ def test_a_measured_force_is_turned_to_the_world(tmp_path: Path):
     )
 
 
+def test_forces_without_a_pose_of_their_frame_are_left_out_and_the_others_used(tmp_path: Path):
+    """The sensor's frame moves, and its last pose is 0.45 s old in the first frame: too old in the third."""
+
+    def force(made: RobotBag) -> None:
+        for index in range(5):
+            T, time = np.eye(4), (2 * index - 17) * STEP // 2
+            T[0, 3] = 0.01 * index
+            made.tf("/tf", time, made.transform("world", "sensor", time, T))
+        for index in range(7):
+            made.wrench("/tool/wrench", index * STEP // 2, [index, 0, 0.5])
+
+    summary, recording = imported(bag(tmp_path, cameras, write_tool, write_images, force))
+    assert [each.force is not None for each in recording] == [True, True, False, False]
+    assert recording.why_no_force is None
+    assert any("5 forces are not used" in note for note in summary.notes)
+
+
 def test_forces_that_are_not_finite_are_counted_and_torques_are_not_needed(tmp_path: Path):
     def force(made: RobotBag) -> None:
         made.tf("/tf_static", 0, made.transform("world", "sensor", 0, np.eye(4)))
