@@ -21,7 +21,7 @@ class ForceSensor:
 
     def __init__(self) -> None:
         self._open, self._offset = list[Float[np.ndarray, " 3"]](), np.zeros(3)
-        self._offset_share, self._squares, self._degrees = 0.0, 0.0, 0
+        self._offset_share, self._offset_number, self._squares, self._degrees = 0.0, 0, 0.0, 0
 
     def look(self, observation: Observation) -> MeasuredPull | None:
         """Return the force in an observation; None with open jaws, and where none was reported."""
@@ -33,6 +33,7 @@ class ForceSensor:
         if self._open:
             values = np.array(self._open)
             self._offset, self._offset_share = values.mean(axis=0), 1 / len(values)
+            self._offset_number += 1
             self._squares += float(np.sum((values - self._offset) ** 2))
             self._degrees += 3 * (len(values) - 1)
             self._open = []
@@ -42,7 +43,9 @@ class ForceSensor:
         return MeasuredPull(
             index=jnp.asarray(observation.index),
             pull=jnp.asarray(self._offset - force.on_tool),
-            covariance=jnp.asarray(sd**2 * (1 + self._offset_share) * np.eye(3)),
+            covariance=jnp.asarray(sd**2 * np.eye(3)),
+            offset_sd=jnp.asarray(sd * self._offset_share**0.5),
+            offset_number=jnp.asarray(self._offset_number),
         )
 
     @property

@@ -31,7 +31,11 @@ class MeasuredPull(eqx.Module):
     pull: Float[Array, " 3"]
     """The force in the world [N]: minus that on the tool."""
     covariance: Float[Array, "3 3"]
-    """Covariance of its noise [N^2]."""
+    """Covariance of its noise [N^2], without that of the sensor's offset."""
+    offset_sd: Float[Array, ""]
+    """Standard deviation of each component of the offset that was subtracted [N]; 0 where none was."""
+    offset_number: Int[Array, ""]
+    """Number of that offset: frames of the same number err by it alike."""
 
 
 class Evidence(eqx.Module):

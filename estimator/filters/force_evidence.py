@@ -3,8 +3,10 @@
 Positions give stiffnesses relative to the declared membrane stiffness. Where that is off by a factor c, so are all
 elastic forces and every b. With `FrameForce` for the other symbols,
 
-    L = P - loads = c E(s) + n,    n ~ N(0, V_L + c^2 V),    log c ~ N(mean, sd^2).
+    L = P - loads = c E(s) + o + n,    n ~ N(0, V_L + c^2 V),    o ~ N(0, sd_o^2),    log c ~ N(mean, sd^2).
 
+The error o of the sensor's offset is the same in all frames from one opening of the jaws to the next, and does not
+average out over them.
 E is the expected force given what was seen, so its error does not bias c, which that of L as a regressor would [Berkson
 1950, doi:10.1080/01621459.1950.10483349]. Linearised at s and log c, frames add up in information form over both.
 Log c is marginalised for the belief over s; given s it is normal.
@@ -15,7 +17,7 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..belief.gaussian_information import GaussianInformation
 from .tool_force import FrameForce
@@ -43,12 +45,16 @@ class StackedForces:
     model_covariance: Float[np.ndarray, "t 3 3"]
     """Covariance of E given s [N^2]."""
     load_covariance: Float[np.ndarray, "t 3 3"]
-    """Covariance of L [N^2]."""
+    """Covariance of L without o [N^2]."""
+    offset_sd: Float[np.ndarray, " t"]
+    """Standard deviation of each component of o [N]."""
+    offset_number: Int[np.ndarray, " t"]
+    """Number of o, which frames have in common."""
 
     @classmethod
     def of(cls, frames: Sequence[FrameForce]) -> "StackedForces":
         """Stack frames, at least one."""
-        columns = ("dE_ds", "pull", "loads", "model_covariance", "load_covariance")
+        columns = ("dE_ds", "pull", "loads", "model_covariance", "load_covariance", "offset_sd", "offset_number")
         return cls(
             offset=np.array([frame.elastic - frame.dE_ds @ frame.at for frame in frames]),
             **{name: np.array([getattr(frame, name) for frame in frames]) for name in columns},
@@ -61,6 +67,15 @@ class StackedForces:
     def covariance(self, factor: float) -> Float[np.ndarray, "t 3 3"]:
         """Return the covariance of n for a factor c [N^2]."""
         return self.load_covariance + factor**2 * self.model_covariance
+
+    def total_covariance(self, factor: float) -> Float[np.ndarray, "t 3 3"]:
+        """Return the covariance of o + n in each frame for a factor c [N^2]."""
+        return self.covariance(factor) + self.offset_sd[:, None, None] ** 2 * np.eye(3)
+
+    def offsets(self) -> Float[np.ndarray, "t 3 k"]:
+        """Return o of each frame by standard normal variables, three for each offset [N]."""
+        which = self.offset_number[:, None] == np.unique(self.offset_number)
+        return np.kron((self.offset_sd[:, None] * which)[:, None], np.eye(3)[None])
 
 
 class LogFactor(eqx.Module):
@@ -102,17 +117,18 @@ class ForceEvidence:
         factor = np.exp(log_factor)
         root = np.linalg.inv(np.linalg.cholesky(forces.covariance(factor)))
         elastic = factor * forces.elastic(s)
-        J = (root @ (factor * forces.dE_ds)).reshape(-1, len(s))
-        by_log, residual = (
-            (root @ part[..., None]).reshape(-1) for part in (elastic, forces.pull - forces.loads - elastic)
-        )
-        target = residual + J @ s + by_log * log_factor
+        target = forces.pull - forces.loads - elastic + factor * forces.dE_ds @ s + elastic * log_factor
+        columns = np.concatenate([factor * forces.dE_ds, elastic[..., None], target[..., None]], axis=2)
+        whitened, shared = (np.concatenate(root @ part) for part in (columns, forces.offsets()))
+        among = np.linalg.cholesky(np.eye(shared.shape[1]) + shared.T @ shared)
+        explained = np.linalg.solve(among, shared.T @ whitened)
+        products = whitened.T @ whitened - explained.T @ explained
         return cls(
-            precision=J.T @ J,
-            cross=J.T @ by_log,
-            own=float(by_log @ by_log) + before.sd**-2,
-            shift=J.T @ target,
-            own_shift=float(by_log @ target) + before.mean * before.sd**-2,
+            precision=products[:-2, :-2],
+            cross=products[:-2, -2],
+            own=float(products[-2, -2]) + before.sd**-2,
+            shift=products[:-2, -1],
+            own_shift=float(products[-2, -1]) + before.mean * before.sd**-2,
         )
 
     @classmethod
@@ -173,4 +189,4 @@ def innovations(
         factor: c [1].
     """
     spread = factor**2 * forces.dE_ds @ covariance @ np.swapaxes(forces.dE_ds, 1, 2)
-    return forces.pull - forces.loads - factor * forces.elastic(mean), forces.covariance(factor) + spread
+    return forces.pull - forces.loads - factor * forces.elastic(mean), forces.total_covariance(factor) + spread

@@ -77,13 +77,14 @@ class ForceFit(eqx.Module):
         forces = StackedForces.of(frames)
         known = bool(np.isfinite(forces.load_covariance).all())
         if not known:
-            forces = replace(forces, load_covariance=np.nan_to_num(forces.load_covariance))
+            given = {name: np.nan_to_num(getattr(forces, name)) for name in ("load_covariance", "offset_sd")}
+            forces = replace(forces, **given)
         information = belief.information
         precision, shift = np.asarray(information.precision), np.asarray(information.shift)
         covariance = np.linalg.inv(precision)
         mean = covariance @ shift
         difference, spread = innovations(forces, mean, covariance, factor=1.0)
-        sds, given = (np.sqrt(np.diagonal(part, axis1=1, axis2=2)) for part in (spread, forces.covariance(1.0)))
+        sds, given = (np.sqrt(np.diagonal(part, axis1=1, axis2=2)) for part in (spread, forces.total_covariance(1.0)))
         why = doubt(forces.elastic(mean), forces.pull, forces.loads, sds, given) or (None if known else NO_NOISE)
         evidence, log_factor = fitted(forces, precision, shift, before=before)
         return cls(

@@ -61,7 +61,11 @@ class FrameForce(eqx.Module):
     model_covariance: Float[Array, "3 3"]
     """Covariance of `elastic` given s [N^2]."""
     load_covariance: Float[Array, "3 3"]
-    """Covariance of the measured force less `loads` [N^2]."""
+    """Covariance of the measured force less `loads`, without that of the sensor's offset [N^2]."""
+    offset_sd: Float[Array, ""]
+    """See `MeasuredPull`."""
+    offset_number: Int[Array, ""]
+    """See `MeasuredPull`."""
 
 
 @eqx.filter_jit
@@ -104,6 +108,8 @@ def frame_force(balance: ForceBalance, frame: Frame, fit: Fit) -> FrameForce | N
         at=s,
         model_covariance=jnp.einsum("nic,nid->cd", J, Z) + anchors * jnp.eye(3),
         load_covariance=_load_covariance(energy, frame.x, loads - loads_at_rest) + force.covariance,
+        offset_sd=force.offset_sd,
+        offset_number=force.offset_number,
     )
 
 

@@ -27,17 +27,31 @@ def readings(count: int, sd: float | None = None):
 
 
 def test_offset_and_noise_are_those_with_open_jaws():
-    """Tolerances: three standard errors of a mean, and of a standard deviation, of 50 frames."""
+    """Tolerances: three standard errors of a mean, and of a standard deviation, of 50 frames.
+
+    The offset errs by the standard error of its mean.
+    """
     force = readings(50)
     assert force is not None and int(force.index) == 50
     np.testing.assert_allclose(force.pull, [0, 0, 1], atol=3 * SD / 50**0.5)
     found = np.sqrt(np.diagonal(force.covariance))
-    np.testing.assert_allclose(found, SD, rtol=3 / (2 * 150) ** 0.5 + 0.01)
+    np.testing.assert_allclose(found, SD, rtol=3 / (2 * 150) ** 0.5)
+    assert float(force.offset_sd) == pytest.approx(found[0] / 50**0.5)
 
 
 def test_a_stated_noise_counts_and_too_few_frames_say_nothing():
     stated = readings(2, sd=0.5)
     assert stated is not None
-    assert np.asarray(stated.covariance)[0, 0] == pytest.approx(0.25 * 1.5)
+    assert np.asarray(stated.covariance)[0, 0] == pytest.approx(0.25)
+    assert float(stated.offset_sd) ** 2 == pytest.approx(0.25 / 2)
     unknown = readings(MIN_OPEN - 1)
     assert unknown is not None and np.isnan(np.asarray(unknown.covariance)).any()
+
+
+def test_frames_of_one_grasp_share_an_offset_and_those_of_the_next_have_another():
+    sensor, numbers = ForceSensor(), list[int]()
+    for index, closed in enumerate([True, False, True, True, False, True]):
+        force = sensor.look(observation(index, closed=closed, on_tool=OFFSET, sd=SD))
+        numbers += [] if force is None else [int(force.offset_number)]
+        assert force is None or (float(force.offset_sd) > 0) == (index > 0)
+    assert numbers[1] == numbers[2] and len(set(numbers)) == 3
