@@ -41,8 +41,8 @@ class Ratio:
     refused: str | None
     """Reason why the factor is not identified; None where it is."""
     trades_with: str
-    """What looks most alike in the frames when it changes: the other ratio, the attachments, or the height of what is
-    seen above the middle of the sheet."""
+    """What looks most alike in the frames when it changes: the other ratio, the attachments, the height of what is seen
+    above the middle of the sheet, or friction with the bed."""
     correlation: float
     """Size of the correlation with that [1]; near 1 only both together are known."""
 

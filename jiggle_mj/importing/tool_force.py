@@ -24,8 +24,8 @@ AXIS = re.compile(r"(?:^|[\W_])(?:f|force)?[\W_]?([xyz])(?=$|[\W_])", re.IGNOREC
 """An axis in a heading: Fx, force_x, F.x [mN]."""
 STATED = re.compile(r"[\[(]\s*(m?N|cN|kN|gf|kgf|lbf)\s*[\])]|[\s_](mN|cN|kN|gf|kgf|lbf)$")
 """A unit of force in a heading or the name of an array: `Fx [N]`, `force_mN`. `force_n` may be a normal force."""
-TRACKED = ("on tool", "on tissue")
-"""On which of the two the force acts."""
+ACTS_ON = ("on tool", "on tissue")
+"""On which of the two a force may act, that on the tool by default."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,14 +52,14 @@ def read_force_table(table: StrictTable) -> GivenForce | None:
     """
     if not table.given:
         return None
-    on = table.take("acts", kinds.text, TRACKED[0])
-    if on not in TRACKED:
-        raise RecordingError(f"{table.where} acts must be one of {', '.join(map(repr, TRACKED))}; got '{on[:50]}'.")
+    on = table.take("acts", kinds.text, ACTS_ON[0])
+    if on not in ACTS_ON:
+        raise RecordingError(f"{table.where} acts must be one of {', '.join(map(repr, ACTS_ON))}; got '{on[:50]}'.")
     force = GivenForce(
         values=table.take("values", kinds.text, None),
         file=table.take("file", kinds.text, None),
         unit=table.take("unit", kinds.text, ""),
-        factor=unit_of(table, "unit", FORCE_UNITS) * (1 if on == TRACKED[0] else -1),
+        factor=unit_of(table, "unit", FORCE_UNITS) * (1 if on == ACTS_ON[0] else -1),
         sd=table.take("sd", kinds.positive, None),
     )
     table.refuse_unknown()
