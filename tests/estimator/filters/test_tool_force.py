@@ -16,14 +16,18 @@ from jiggle_mj.estimator.filters.config import FilterConfig
 from jiggle_mj.estimator.filters.evidence import Evidence, MeasuredPull
 from jiggle_mj.estimator.filters.force_axes import doubt
 from jiggle_mj.estimator.filters.force_evidence import ForceEvidence, LogFactor, StackedForces, fitted
+from jiggle_mj.estimator.filters.force_fit import StiffnessScale
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
-from jiggle_mj.estimator.filters.tool_force import FrameForce, frame_force
+from jiggle_mj.estimator.filters.posterior_summary import prior_summary
+from jiggle_mj.estimator.filters.tool_force import FRICTION, WEIGHT_ERROR, FrameForce, frame_force
 from jiggle_mj.estimator.perception.mesh_field import MeshField
+from jiggle_mj.estimator.physics.environment import Weight
 from jiggle_mj.estimator.physics.surrogate import surrogate
 from jiggle_mj.estimator.tracked_sheet import TrackedSheet
 from jiggle_mj.observation import Declaration
 from tests.support.small_sheet import (
     DECLARATION,
+    NOISE,
     STIFFNESS,
     attached,
     follow,
@@ -84,6 +88,43 @@ def test_attachments_weight_and_bed_take_up_what_the_tool_pulls(lift):
     np.testing.assert_allclose(found.elastic + found.loads, pull, atol=BALANCED)
     springs = (b[:, None] * (frame.x - sheet().rest)).sum(axis=0)
     np.testing.assert_allclose(rough.elastic, springs, atol=1e-3 * np.linalg.norm(springs))
+
+
+def test_the_errors_of_anchors_positions_friction_and_weight_are_in_the_covariances():
+    """Where forces err by far more than anchors, E is sum b d, and errs by that of each position and each anchor. What
+    presses on the bed is the weight less what the tool lifts; friction is a share of it, across the vertical."""
+    frame, b = lifts()[3], STIFFNESS * attached()
+    balance, s = sheet_balance(ROUGH_SD), jnp.asarray(b / (b + K))
+    found = force_at(balance, jnp.asarray(frame.x), s, with_force(exact(frame), pull_of(frame, b)))
+    expected = float(np.sum(b**2)) * (NOISE**2 + float(balance.anchor_sd) ** 2)
+    np.testing.assert_allclose(np.diagonal(found.model_covariance)[:2], expected, rtol=0.01)
+    weight = -float(sum(term.force.sum(axis=0)[2] for term in sheet_energy().terms if isinstance(term, Weight)))
+    lifted = float(found.loads[2])
+    assert 0.1 < lifted / weight < 0.9
+    horizontal, vertical = (FRICTION * (weight - lifted)) ** 2, (WEIGHT_ERROR * lifted) ** 2
+    of_sensor = np.diagonal(found.load_covariance) - SENSOR_SD**2
+    np.testing.assert_allclose(of_sensor, [horizontal, horizontal, vertical], rtol=1e-6)
+
+
+def test_a_factor_that_varies_with_the_stiffnesses_widens_or_narrows_each():
+    """Against 20 000 draws of s and log c together, b = c b_ref s / (1 - s): within four standard errors of an sd."""
+    rng, s, factor = np.random.default_rng(0), np.full(sheet().n, 0.1), 1.5
+    root = 0.003 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [8.0, -8.0, 2.0]])
+    whole = root @ root.T
+    drawn = rng.normal(size=(20_000, 3)) @ root.T
+    cross = np.append(whole[:2, 2], np.zeros(len(s) - 2))
+    scale = StiffnessScale(factor=factor, log_sd=float(whole[2, 2] ** 0.5), log_with_s=cross)
+    summary = replace(
+        prior_summary(sheet_prior(), len(s)), b=jnp.asarray(K * s / (1 - s)), sd=jnp.full(len(s), 0.003 * K / 0.9**2)
+    )
+    b, sd = summaries.stiffness(summary, scale)
+    sample = factor * np.exp(drawn[:, 2:]) * K * (0.1 + drawn[:, :2]) / (0.9 - drawn[:, :2])
+    np.testing.assert_allclose(sd[:2], sample.std(axis=0), rtol=4 / np.sqrt(2 * len(sample)))
+    np.testing.assert_allclose(b, factor * K / 9)
+    z = sample / (sample + factor * K)
+    expected = np.cov(z.T) - whole[:2, :2]
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(scale.added_covariance(s)[:2, :2], expected, atol=0.05 * size)
 
 
 def test_a_weld_counts_by_the_forces_around_it():
