@@ -138,7 +138,8 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ReferenceSummar
     return {summary.name: summary for summary in summaries(results)}
 
 
-OPEN = pytest.mark.xfail(reason="the evidence leaves out the log determinant of its Jacobian: stiffness comes out low")
+OPEN = pytest.mark.xfail(reason="the evidence leaves out the log determinant of its Jacobian: too few are attached")
+LOW = pytest.mark.xfail(reason="stiffness comes out low")
 """What is known to be off: see docs/STUDIES.md."""
 
 
@@ -150,7 +151,7 @@ OPEN = pytest.mark.xfail(reason="the evidence leaves out the log determinant of 
         ("exact", "number attached"),
         ("assumed", "b, middle"),
         pytest.param("assumed", "number attached", marks=OPEN),
-        pytest.param("assumed", "sum of b over a patch", marks=OPEN),
+        pytest.param("assumed", "sum of b over a patch", marks=LOW),
         pytest.param("mujoco", "number attached", marks=OPEN),
     ],
 )
