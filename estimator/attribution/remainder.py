@@ -1,14 +1,15 @@
 """The remainder: what neither the model nor a named effect explains, as a random process with a variance and no name.
 
 The residual of each particle is a Student-t process [Shah, Wilson & Ghahramani 2014, arXiv:1402.4306] over the tool's
-displacement u and the time t, as a discrepancy is a Gaussian process of the inputs [Kennedy & O'Hagan 2001,
-doi:10.1111/1467-9868.00294]. With g the grasp its covariance is
+displacement u and the time t since the jaws closed, as a discrepancy is a Gaussian process of the inputs [Kennedy &
+O'Hagan 2001, doi:10.1111/1467-9868.00294]. Within a grasp its covariance is
 
-    [g = g'] (offset + share u.u' / U^2) + drift t t' / T^2 + walk min(t, t') / T + (white + noise) [t = t'],
+    offset + share u.u' / U^2 + drift t t' / T^2 + walk min(t, t') / T + (white + noise) [t = t'],
 
-so that the three predictions without a model are special cases of it: nothing moves, the last frame stays (`walk`), and
-each particle goes its own linear share of the tool's displacement (`share`). Particles are independent, and each has a
-variance of its own: the residual is larger near the grasp, and a tracker loses some points.
+and 0 between grasps: what one pull leaves unexplained says how much another one may, not in which direction. The
+predictions without a model are special cases: nothing moves, the last frame stays (`walk`), and each particle goes its
+own linear share of the tool's displacement (`share`). Particles are independent, and each has a variance of its own:
+the residual is larger near the grasp, and a tracker loses some points.
 
 It is fitted after all effects and never before them, so it takes nothing that an effect explains.
 """
@@ -158,12 +159,12 @@ def remainder(
 
 def _terms(frames: list[Timed]) -> Float[np.ndarray, "terms frames frames"]:
     """Return the covariance between frames of each of `TERMS` of a variance of 1."""
-    grasp, time = np.array([timed.grasp for timed in frames]), np.array([timed.time for timed in frames])
+    grasp, time = np.array([timed.grasp for timed in frames]), np.array([timed.closed for timed in frames])
     u = np.array([np.asarray(timed.frame.displacement) for timed in frames])
     same = (grasp[:, None] == grasp[None]).astype(float)
     longest, last = np.max(np.sum(u**2, axis=1)), max(float(time.max()), np.finfo(float).tiny)
     share = same * (u @ u.T) / max(float(longest), np.finfo(float).tiny)
-    drift, walk = np.outer(time, time) / last**2, np.minimum(time[:, None], time[None]) / last
+    drift, walk = same * np.outer(time, time) / last**2, same * np.minimum(time[:, None], time[None]) / last
     return np.array([same, share, drift, walk, np.eye(len(frames))])
 
 

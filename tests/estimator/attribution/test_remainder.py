@@ -25,7 +25,7 @@ def frames(*, seen: np.ndarray | None = None) -> list[Timed]:
     return [timed(k, np.array([0.0, sideways[k], pulled[k]]), seen[k]) for k in range(FRAMES)]
 
 
-def timed(k: int, displacement: np.ndarray, seen: np.ndarray) -> Timed:
+def timed(k: int, displacement: np.ndarray, seen: np.ndarray, grasp: int = 0) -> Timed:
     """Return a frame of which the tool's displacement [m], the time and the observed particles matter."""
     zeros, nothing = jnp.zeros((PARTICLES, 3)), jnp.zeros(PARTICLES, bool)
     frame = ClosedFrame(
@@ -40,7 +40,7 @@ def timed(k: int, displacement: np.ndarray, seen: np.ndarray) -> Timed:
         held_sd=jnp.asarray(0.0),
     )
     part, rest = int(k >= FITTED), np.zeros((PARTICLES, 3))
-    return Timed(frame=frame, index=k, grasp=0, part=part, time=1.0 + k, closed=float(k), state=rest, reports=())
+    return Timed(frame=frame, index=k, grasp=grasp, part=part, time=1.0 + k, closed=1.0 + k, state=rest, reports=())
 
 
 def drawn(terms: tuple[str, ...], seed: int) -> np.ndarray:
@@ -109,6 +109,20 @@ def test_what_is_not_observed_or_not_fitted_does_not_count():
     mean, variance = found.of(frames(seen=seen), 1)
     assert len(mean) == len(variance) == seen[FITTED:].sum()
     np.testing.assert_array_equal(mean, found.mean[FITTED:][seen[FITTED:]])
+
+
+def test_another_grasp_has_no_mean_and_intervals_that_hold():
+    """Both grasps are draws of the same process, of which the first alone is fitted to."""
+    residual = np.concatenate([drawn(TERMS, seed=13), drawn(TERMS, seed=14)])
+    first, noise = frames(), np.full((2 * FRAMES, PARTICLES), NOISE**2)
+    second = [
+        timed(k, np.asarray(one.frame.displacement), np.ones(PARTICLES, bool), grasp=1) for k, one in enumerate(first)
+    ]
+    with jax.enable_x64(True):
+        found = remainder([*first, *second], residual, np.arange(2 * FRAMES) < FRAMES, noise=noise)
+    assert (found.mean[FRAMES:] == 0).all()
+    held = np.abs(residual[FRAMES:]) <= 1.645 * np.sqrt(found.variance[FRAMES:, :, None])
+    assert COVERAGE[0] - 0.06 <= held.mean() <= COVERAGE[1] + 0.03
 
 
 def test_without_an_observed_residual_there_is_none():
