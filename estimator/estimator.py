@@ -1,8 +1,7 @@
 """The estimator: observations in, estimates out.
 
 While the sheet lies still before the first grasp, frames only fix its rest shape. Every frame with closed jaws then
-goes through perception, grip, fusion and filter, in this order. The estimator sees nothing but observations, the
-camera's calibration and the declaration.
+goes through perception, grip, fusion and filter. It sees nothing but observations, calibration and declaration.
 """
 
 import time
@@ -70,6 +69,8 @@ class Estimator:
         self.config = config = as_instance(EstimatorConfig() if config is None else config, "config", EstimatorConfig)
         self.skipped: list[tuple[int, str]] = []
         """Index and reason of each observation that could not be used."""
+        self.cloud_shares: list[float] = []
+        """Share of the cloud's points that lie on the sheet, of each used frame with a cloud."""
         self._perception = Perception(
             declaration, camera, spacing=config.spacing, config=config.perception, mask=mask, disparity=disparity
         )
@@ -131,7 +132,9 @@ class Estimator:
         state, update = tracked.filter.update(tracked.state, frame.evidence, jnp.asarray(frame.start))
         if not update.explains_the_frame:
             raise PerceptionError(f"observation {observation.index} leaves no finite state: no sheet explains it.")
-        track = track if track.cloud is None else matched(track.cloud, np.asarray(update.x), hold.held)
+        if track.cloud is not None:
+            track, share = matched(track.cloud, np.asarray(update.x), hold.held)
+            self.cloud_shares.append(share)
         tracked.state, tracked.x = state, np.asarray(update.x)
         self._grip.hold, self._slip = hold, frame.slip
         self._seen_precision = track.white_precision[track.visible].mean(axis=0)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
 from .actions import Action
@@ -34,6 +35,9 @@ SALT_BYTES = 16
 """Random bytes of a salt: 128 bits, which nobody can try out."""
 SHOWN_REASONS = 3
 """How many skipped frames an error names, so that it stays one line."""
+MAX_SKIPPED_SHARE = 0.6
+"""Largest share of the frames with closed jaws that may be skipped: where most show something else than the sheet, the
+few that are used are no result. A half is skipped where one camera has half the rate of the other."""
 
 OnFrame = Callable[[Observation, Estimate | None], None]
 """Callback after each frame, for progress; the estimate is None for a frame that updates nothing."""
@@ -59,6 +63,8 @@ class Episode:
     """Index and reason of each frame that the recording or the estimator could not use."""
     point_noise: PointNoise | None = None
     """Noise of measured points that the estimator counted with; None for images."""
+    cloud_share: float | None = None
+    """Median share of a cloud's points that lie on the sheet, over the used frames; None without clouds."""
     force: ForceCheck | None = None
     """Measured and predicted force on the tool; None where none was measured."""
 
@@ -236,10 +242,11 @@ def estimate(
         on_frame: called after each frame.
 
     Raises:
-        PerceptionError: no frame could be used, or `Estimator.update` raises it.
+        PerceptionError: no frame could be used, or most frames with closed jaws could not, or `Estimator.update` raises
+            it.
     """
     estimates: list[Estimate] = []
-    n_frames = 0
+    n_frames, closed = 0, list[int]()
     with ExitStack() as files:
         writer: EstimateWriter | None = None
         for observation in observations:
@@ -252,6 +259,8 @@ def estimate(
                     writer.write(updated, n_skipped=len(estimator.skipped))
                 estimates.append(updated)
             n_frames += 1
+            if observation.tool.closed:
+                closed.append(observation.index)
             if on_frame is not None:
                 on_frame(observation, updated)
         estimator.release()
@@ -263,6 +272,7 @@ def estimate(
                 f"no frame could be used ({why or 'none has closed jaws'}); the estimator learns from frames in which "
                 "the tool holds the tissue."
             )
+        _refuse_most_skipped(closed, len(estimates), skipped)
         if writer is not None:
             writer.finish(estimator.belief, estimator.detection, skipped=skipped, frames=estimator.kept_frames)
     return Episode(
@@ -274,5 +284,30 @@ def estimate(
         n_frames=n_frames + len(unreadable),
         skipped=skipped,
         point_noise=estimator.point_noise,
+        cloud_share=median(estimator.cloud_shares) if estimator.cloud_shares else None,
         force=estimator.force_check,
     )
+
+
+def _refuse_most_skipped(closed: list[int], n_used: int, skipped: Iterable[tuple[int, str]]) -> None:
+    """Refuse an estimate from a few frames only, of a recording that does not show the sheet in most.
+
+    Args:
+        closed: index of each readable frame with closed jaws, at least one.
+        n_used: how many of them are used.
+        skipped: index and reason of all that were not used.
+
+    Raises:
+        PerceptionError: more than `MAX_SKIPPED_SHARE` of the frames since the jaws closed first were skipped; those
+            with open jaws do not count.
+    """
+    reasons = dict(reversed([(index, why) for index, why in skipped if index >= closed[0]]))
+    n_frames = len(closed) + len(reasons.keys() - set(closed))
+    n_skipped = n_frames - n_used
+    if n_skipped > MAX_SKIPPED_SHARE * n_frames:
+        index = min(reasons)
+        raise PerceptionError(
+            f"{n_skipped} of {n_frames} frames with closed jaws cannot be used; at most {MAX_SKIPPED_SHARE:.0%} may be "
+            f"skipped. The first one is frame {index}: {reasons[index].rstrip('.')}. Mend what these frames should "
+            "show, or leave them out of the recording."
+        )

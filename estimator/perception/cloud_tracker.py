@@ -111,15 +111,17 @@ class CloudTracker:
         return jnp.asarray(np.pad(cloud, ((0, rows), (0, 0)), constant_values=np.nan))
 
 
-def matched(cloud: Cloud, x: Float[np.ndarray, "n 3"], held: Bool[np.ndarray, " n"]) -> Track:
-    """Return what a cloud shows of the particles, once the state is known [m]; they lie within a spacing of it.
+def matched(cloud: Cloud, x: Float[np.ndarray, "n 3"], held: Bool[np.ndarray, " n"]) -> tuple[Track, float]:
+    """Return what a cloud shows of the particles, once the state is known, and the share of its points on the sheet.
+
+    The particles lie within a spacing of the state [m].
 
     Raises:
         PerceptionError: most of the points lie off the sheet.
     """
     belongs, pull, precision = (np.asarray(part) for part in _shown(cloud, jnp.asarray(x), jnp.asarray(held)))
     known = np.isfinite(cloud.points).all(axis=1)
-    share = belongs.sum() / max(int(known.sum()), 1)
+    share = float(belongs.sum()) / max(int(known.sum()), 1)
     if share < MIN_SHARE:
         raise PerceptionError(
             f"{share:.0%} of the cloud's points lie on the sheet, and {MIN_SHARE:.0%} are needed: the cloud is of "
@@ -129,7 +131,8 @@ def matched(cloud: Cloud, x: Float[np.ndarray, "n 3"], held: Bool[np.ndarray, " 
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
     seen = np.trace(precision, axis1=1, axis2=2) > 0
     moved = np.einsum("nij,nj->ni", covariance, pull)
-    return Track(positions=np.where(seen[:, None], x + moved, np.nan), covariance=covariance, visible=seen)
+    positions = np.where(seen[:, None], x + moved, np.nan)
+    return Track(positions=positions, covariance=covariance, visible=seen), share
 
 
 @eqx.filter_jit

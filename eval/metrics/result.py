@@ -97,6 +97,7 @@ def result(run: Run) -> Json:
             "force_sd_ratio": detection.force_sd_ratio,
             "position_sd_ratio": detection.position_sd_ratio,
             "points": _point_noise(episode.point_noise),
+            "cloud_share": episode.cloud_share,
         },
         "force": _force(episode.force),
         "calibration": dict.fromkeys(field.name for field in fields(Calibration)),

@@ -1,5 +1,6 @@
 """Sentences of a report: what was found, how it compares with the truth, and why to doubt it."""
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +13,8 @@ from ..metrics.detection_metrics import dilate, patches
 from ..metrics.flat_map import Plane
 from ..metrics.truth_transfer import TransferredTruth
 
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
+"""A number in a reason."""
 MAX_SD_RATIO = 1.5
 """Largest ratio of the found to the assumed standard deviation of a noise that is no doubt yet."""
 MAX_FORCE_NIS = 3.0
@@ -20,6 +23,9 @@ SURE_FACTOR = 2.0
 """Logarithm of the stiffness factor from which the declared stiffness is doubted [standard deviation]."""
 MIN_FACTOR = 1.15
 """Stiffness factor, or one over it, below which it is no doubt [1]: the model and its bed are not better than that."""
+MIN_CLOUD_SHARE = 0.8
+"""Smallest share of a cloud's points on the sheet that is no doubt yet [1]: 0.95 where 5 % are outliers; the tool shows
+as well. What lies below the sheet pulls it down where both are near."""
 LISTED_PATCHES = 3
 """Patches whose place is given; the others are counted."""
 
@@ -71,12 +77,35 @@ def stiffness_sums(sheet: Sheet, belief: Belief, detection: Detection, transferr
     return f"Over these and one ring around them b sums to {total:.1f} N/m, with {deviation}; the truth is {true:.1f}."
 
 
+def skipped_frames(figures: Mapping[str, Any]) -> list[str]:
+    """Return a line for each reason for which frames were skipped, from `result.json`.
+
+    Reasons that differ in their numbers alone are one.
+    """
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for skipped in figures["frames"]["skipped"]:
+        groups.setdefault(NUMBER.sub("#", skipped["why"]), []).append(skipped)
+    lines = []
+    for first, *more in groups.values():
+        which = f"frame {first['index']} skipped"
+        if more:
+            count, last = 1 + len(more), more[-1]["index"]
+            which = f"{count} of {figures['n_frames']} frames skipped, from frame {first['index']} to {last}"
+        lines.append(f"{which}: {first['why']}")
+    return lines
+
+
 def doubts(figures: Mapping[str, Any]) -> list[str]:
     """Return reasons to doubt what was found, from `result.json`; none from a version that did not write them."""
     sentences = []
+    noise = figures.get("noise", {})
+    if (share := noise.get("cloud_share")) is not None and share < MIN_CLOUD_SHARE:
+        sentences.append(
+            f"{1 - share:.0%} of the clouds' points lie off the sheet: those of the bed, the tool or a second sheet "
+            "bend it where they are near. Crop the clouds to the sheet, and estimate again."
+        )
     if not figures["detection"].get("converged", True):
         sentences.append("Two halves of the samples disagree: more samples would give other probabilities.")
-    noise = figures.get("noise", {})
     for name, what in (("force_sd_ratio", "The model's forces"), ("position_sd_ratio", "The positions")):
         if (ratio := noise.get(name)) is not None and ratio > MAX_SD_RATIO:
             sentences.append(

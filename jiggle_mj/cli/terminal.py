@@ -97,9 +97,11 @@ def bar(total: int, title: str) -> Iterator[Callable[..., None]]:
 
 def show(figures: dict, out: Path, as_json: bool) -> None:
     """Print a summary of result.json to stderr, and all of it to stdout with --json."""
-    from jiggle_mj.eval.report.verdict import doubts
+    from jiggle_mj.eval.report.verdict import doubts, skipped_frames
 
     detection, calibration = figures["detection"], figures["calibration"]
+    for line in skipped_frames(figures):
+        console.print(line, highlight=False)
     console.print(
         f"{detection['n_detected']} of {figures['n_particles']} particles reported attached ({detection['rule']})",
     )
@@ -118,8 +120,6 @@ def show(figures: dict, out: Path, as_json: bool) -> None:
         if figures["tracking"]["rms_m"] is not None:
             parts.append(f"tracking RMS {1e3 * figures['tracking']['rms_m']:.2f} mm")
         console.print(", ".join(parts))
-    for skipped in figures["frames"]["skipped"]:
-        console.print(f"frame {skipped['index']} skipped: {skipped['why']}", highlight=False)
     for index in figures["frames"]["not_converged"]:
         console.print(f"frame {index}: the search for the sheet's state did not converge; trust this frame less.")
     for doubt in doubts(figures):

@@ -94,7 +94,7 @@ def test_frames_that_the_recording_skips_are_named_when_none_remains(recording, 
 
 def test_frames_skipped_by_recording_and_estimator_are_counted_together(recording, tmp_path):
     _, seen = recording
-    first = next(observation for observation in seen if observation.tool.closed)
+    first = [observation for observation in seen if observation.tool.closed][1]
     lost = replace(first, index=first.index + 1, tool=malformed(first.tool, position=np.full(3, np.nan)))
     nowhere = replace(first.points, positions=np.full_like(first.points.positions, np.nan))
     hidden = replace(seen[lost.index + 1], points=nowhere)
@@ -104,7 +104,25 @@ def test_frames_skipped_by_recording_and_estimator_are_counted_together(recordin
     opened = Recording.open(tmp_path / "gaps.mcap")
     episode = estimate(opened, Estimator(opened.declaration))
     assert [index for index, _ in episode.skipped] == [lost.index, hidden.index]
-    assert (episode.n_frames, len(episode.estimates)) == (hidden.index + 1, 1)
+    assert (episode.n_frames, len(episode.estimates)) == (hidden.index + 1, 2)
+
+
+@pytest.mark.parametrize("unreadable", [True, False])
+def test_a_recording_that_shows_the_sheet_in_one_frame_of_four_gives_no_estimate(recording, tmp_path, unreadable):
+    """Whether the recording or the estimator skips the others: one frame is no result, and the first is named."""
+    _, seen = recording
+    k = next(observation.index for observation in seen if observation.tool.closed)
+    with RecordingWriter(tmp_path / "lost.mcap", camera=None, declaration=Declaration(), metadata={}) as writer:
+        for observation in seen[: k + 1]:
+            writer.write(observation)
+        for j in range(1, 4):
+            later = replace(seen[k], index=k + j, time=seen[k].time + j * 10**8)
+            nowhere = replace(later.points, positions=np.full_like(later.points.positions, np.nan))
+            off = malformed(later.tool, position=np.full(3, np.nan))
+            writer.write(replace(later, tool=off) if unreadable else replace(later, points=nowhere))
+    opened = Recording.open(tmp_path / "lost.mcap")
+    with pytest.raises(PerceptionError, match=f"3 of 4 frames with closed jaws .* at most 60%.* frame {k + 1}: "):
+        estimate(opened, Estimator(opened.declaration))
 
 
 def test_a_folder_with_results_is_kept_unless_overwriting_is_allowed(tmp_path):

@@ -16,7 +16,7 @@ KEYS = {
         },
         "estimator": {},
     },
-    "noise": dict.fromkeys(("force_sd_ratio", "position_sd_ratio", "points")),
+    "noise": dict.fromkeys(("force_sd_ratio", "position_sd_ratio", "points", "cloud_share")),
     "force": None,
     "calibration": dict.fromkeys(
         (

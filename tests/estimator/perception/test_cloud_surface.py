@@ -128,8 +128,8 @@ def test_a_cloud_of_something_else_is_refused():
     many = np.concatenate([cloud(sheet().rest, seed, SD) for seed in range(40, 60)])
     track = tracker.unmatched(MeasuredPoints(positions=many, sd=SD))
     assert track.cloud is not None and np.isfinite(track.cloud.points).all(axis=1).sum() == 3000
-    shown = matched(track.cloud, sheet().rest, np.zeros(sheet().n, bool))
-    assert shown.visible.all() and np.abs(shown.positions - sheet().rest)[inner()].max() < SD
+    shown, share = matched(track.cloud, sheet().rest, np.zeros(sheet().n, bool))
+    assert share > 0.99 and shown.visible.all() and np.abs(shown.positions - sheet().rest)[inner()].max() < SD
 
 
 def test_dense_clouds_move_the_outline_by_no_more_than_its_noise():

@@ -23,7 +23,7 @@ from jiggle_mj.eval.metrics.result import Run, result, with_truth
 from jiggle_mj.eval.metrics.truth_transfer import TransferredTruth, transfer
 from jiggle_mj.eval.report.pictures import pictures
 from jiggle_mj.eval.report.run_page import write_report
-from jiggle_mj.eval.report.verdict import against_truth, doubts, found, stiffness_sums
+from jiggle_mj.eval.report.verdict import against_truth, doubts, found, skipped_frames, stiffness_sums
 from jiggle_mj.observation import StereoPair
 from jiggle_mj.truth import Truth, TruthFrame
 
@@ -252,6 +252,15 @@ def test_what_the_force_says_against_the_declaration_or_itself_is_shown(changes,
     assert found == [] if words is None else words in found[0] and len(found) == 1
 
 
+def test_frames_that_are_skipped_for_one_reason_are_one_line():
+    """Reasons that differ in their numbers alone are one; another reason is another line."""
+    reasons = ["0% of the cloud lies on the sheet", "3.5% of the cloud lies on the sheet", "no particle was seen"]
+    skipped = [{"index": 7 + k, "why": reason} for k, reason in enumerate([*reasons, reasons[0]])]
+    many, one = skipped_frames({"n_frames": 30, "frames": {"skipped": skipped}})
+    assert many == f"3 of 30 frames skipped, from frame 7 to 10: {reasons[0]}"
+    assert one == f"frame 9 skipped: {reasons[2]}"
+
+
 def test_doubts_are_listed_where_there_are_any(tmp_path):
     good = {"detection": {"converged": True}, "noise": {"force_sd_ratio": 1.4, "position_sd_ratio": None}}
     bad = {"detection": {"converged": False}, "noise": {"force_sd_ratio": 12.04, "position_sd_ratio": 1.2}}
@@ -262,6 +271,9 @@ def test_doubts_are_listed_where_there_are_any(tmp_path):
     (shown,) = doubts({"detection": {}, "noise": {"points": noisy}})
     assert "a noise of 0.5 mm where the recording states 0.2 mm" in shown
     assert not doubts({"detection": {}, "noise": {"points": noisy | {"stated_sd_m": 3e-4}}})
+    (off,) = doubts({"detection": {}, "noise": {"cloud_share": 0.51}})
+    assert "49% of the clouds' points lie off the sheet" in off
+    assert not doubts({"detection": {}, "noise": {"cloud_share": 0.94}})
     run = synthetic()
     parts = {name: run[name] for name in ("sheet", "estimates", "belief")}
     poor = dataclasses.replace(run["detection"], converged=False)
