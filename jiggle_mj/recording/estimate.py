@@ -36,6 +36,8 @@ ESTIMATE_POINTS, ESTIMATE_MESH, DIAGNOSTICS = "/estimate/points", "/estimate/mes
 """Topics."""
 SHEET, BELIEF, DETECTION = "sheet.npz", "belief.npz", "detection.npz"
 """Attachments."""
+ESTIMATE_AGAIN = "Estimate the recording again; read_estimate(path, allow_truncated=True) reads the frames that remain."
+"""What to do about an estimate that was cut off."""
 RESULT_RECORD = "jiggle_mj.result"
 """Metadata record with the detection's rule and the skipped frames."""
 DIAGNOSTICS_SCHEMA: dict[str, object] = {
@@ -169,7 +171,7 @@ def read_estimate(path: str | os.PathLike[str], *, allow_truncated: bool = False
         RecordingError: missing, not an MCAP, truncated, damaged, not an estimate, or written by another version.
     """
     path = Path(path)
-    content = read_messages(path, (ESTIMATE_POINTS, DIAGNOSTICS), allow_truncated=allow_truncated)
+    content = read_messages(path, (ESTIMATE_POINTS, DIAGNOSTICS), allow_truncated=allow_truncated, cure=ESTIMATE_AGAIN)
     if SHEET not in content.attachments:
         raise RecordingError(f"{path} is not an estimate: it lacks {SHEET}; its topics are: {content.topics}.")
     arrays = {

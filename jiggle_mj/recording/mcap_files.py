@@ -42,6 +42,8 @@ MAX_RECORD_BYTES = 1 << 30
 """Largest record [byte]: 1 GiB, four times the largest chunk; attachments may be that large."""
 MAX_TIME_NS = (1 << 63) - 1
 """Latest time of a message [ns]: signed 64 bits, as numpy and protobuf hold it; the year 2262."""
+RECORD_AGAIN = "Record it again, or read its complete records with allow_truncated=True (--allow-truncated)."
+"""What to do about a recording, or its truth, that was cut off."""
 
 
 def truth_path(recording: Path) -> Path:
@@ -148,13 +150,14 @@ def read_arrays(attachment: Attachment, path: Path) -> dict[str, np.ndarray]:
 
 
 def iterate_records(
-    path: str | os.PathLike[str], *, allow_truncated: bool = False
+    path: str | os.PathLike[str], *, allow_truncated: bool = False, cure: str = RECORD_AGAIN
 ) -> Iterator[Schema | Channel | McapMessage | Metadata | Attachment]:
     """Yield records in file order, checksums verified.
 
     Args:
         path: an MCAP file.
         allow_truncated: read the complete records of a file that was cut off, instead of refusing it.
+        cure: what to do about one that was cut off.
 
     Raises:
         RecordingError: missing, not an MCAP, truncated, damaged.
@@ -173,9 +176,8 @@ def iterate_records(
         end, complete = _end_of_records(file)
         if not complete and not allow_truncated:
             raise RecordingError(
-                f"{path} is truncated: complete records end at byte {end} and the MCAP footer is missing "
-                "(was the recording cut off?). Record it again, or read its complete records with allow_truncated=True "
-                "(--allow-truncated)."
+                f"{path} is truncated: complete records end at byte {end} and the MCAP footer is missing (was it cut "
+                f"off?). {cure}"
             )
         file.seek(0)
         source = _FirstBytes(file, end)

@@ -10,7 +10,7 @@ from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Message, Metadata
 
 from ..errors import MAX_SHOWN, RecordingError
-from .mcap_files import MAX_TIME_NS, iterate_records
+from .mcap_files import MAX_TIME_NS, RECORD_AGAIN, iterate_records
 
 Parsed = TypeVar("Parsed")
 
@@ -66,13 +66,14 @@ class FileContent:
         return frames
 
 
-def read_messages(path: Path, wanted: Sequence[str], *, allow_truncated: bool) -> FileContent:
+def read_messages(path: Path, wanted: Sequence[str], *, allow_truncated: bool, cure: str = RECORD_AGAIN) -> FileContent:
     """Return the content of a small file.
 
     Args:
         path: an MCAP file.
         wanted: topics whose messages are kept.
         allow_truncated: read the complete records of a file that was cut off.
+        cure: what to do about one that was cut off.
 
     Raises:
         RecordingError: missing, not an MCAP, truncated, damaged.
@@ -81,7 +82,7 @@ def read_messages(path: Path, wanted: Sequence[str], *, allow_truncated: bool) -
     messages: dict[str, list[Message]] = {topic: [] for topic in wanted}
     attachments: dict[str, Attachment] = {}
     metadata: dict[str, dict[str, str]] = {}
-    for record in iterate_records(path, allow_truncated=allow_truncated):
+    for record in iterate_records(path, allow_truncated=allow_truncated, cure=cure):
         if isinstance(record, Channel):
             topics[record.id] = record.topic
         elif isinstance(record, Message):
