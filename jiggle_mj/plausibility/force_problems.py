@@ -9,9 +9,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..force_scatter import ForceScatter
 from ..observation import MeasuredForce, ToolState
 from ..recording.reader import Recording
 from .problem import RecordingProblem, warning
+from .tool_problems import NOISE_MULTIPLES
 
 DOUBTED_FORCE_N = 50.0
 """Largest change of the force on the tool that is no doubt [N]: tissue tears at less, and mN called N are beyond it."""
@@ -26,7 +28,7 @@ GAINED_SHARE = 0.5
 def force_problems(
     recording: Recording, frames: Sequence[tuple[ToolState, MeasuredForce | None]]
 ) -> Iterator[RecordingProblem]:
-    """Find a force in an unknown frame, of an unlikely size, of the opposite sign, or that lacks an axis.
+    """Find a force in an unknown frame, of an unlikely size, of the opposite sign, of other noise, or that lacks axes.
 
     Args:
         recording: an open recording.
@@ -38,6 +40,8 @@ def force_problems(
             f"the force on the tool is not used: {recording.why_no_force} Give it in the world, in a frame that /tf "
             "joins to it, or in the frame '/tool/pose', the axes of the tool.",
         )
+    yield from _not_finite(*recording.lost_forces)
+    yield from _noise(frames)
     yield from _missing_axes([force.on_tool for _, force in frames if force is not None])
     offset, start, grasp = np.zeros(3), np.zeros(3), None
     work, unsigned, largest = 0.0, 0.0, 0.0
@@ -76,3 +80,44 @@ def _missing_axes(forces: Sequence[Float[np.ndarray, " 3"]]) -> Iterator[Recordi
             f"the force on the tool changes along {n_seen} of three axes only, and counts as measured in all: record "
             "all components, or leave the force out.",
         )
+
+
+def _not_finite(n_lost: int, n_forces: int) -> Iterator[RecordingProblem]:
+    """Find forces that are no numbers: some are lost readings, and all are no measurement."""
+    if not n_lost:
+        return
+    if n_lost == n_forces:
+        yield RecordingProblem(
+            name="force-missing",
+            refuses=True,
+            text=f"none of the {n_forces} forces on the tool is three finite numbers; record what the sensor measures, "
+            "or leave /tool/force out.",
+        )
+        return
+    yield warning(
+        "force-missing",
+        f"{n_lost} of {n_forces} forces on the tool are not three finite numbers; they count as not measured.",
+    )
+
+
+def _noise(frames: Sequence[tuple[ToolState, MeasuredForce | None]]) -> Iterator[RecordingProblem]:
+    """Find a stated noise that the scatter with open jaws contradicts."""
+    scatter, stated = ForceScatter(), list[float]()
+    for tool, force in frames:
+        if tool.closed:
+            scatter.close()
+        elif force is not None:
+            scatter.add(force.on_tool)
+        if force is not None and force.sd is not None:
+            stated.append(force.sd)
+    scatter.close()
+    measured, sd = scatter.sd, float(np.median(stated)) if stated else None
+    if measured is None or sd is None:
+        return
+    shown = f"the noise of the force is stated as {sd:.2g} N, and with open jaws it is {measured:.2g} N"
+    if scatter.exceeds(sd):
+        yield warning(
+            "force-noise", f"{shown}; the larger one counts. Is sd in N, and does the tool hang still while it is open?"
+        )
+    elif sd > NOISE_MULTIPLES * measured:
+        yield warning("force-noise", f"{shown}; unless it is larger while the jaws are closed, a smaller sd says more.")

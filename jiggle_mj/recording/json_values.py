@@ -12,20 +12,21 @@ MAX_JSON_BYTES = 1 << 26
 """Longest JSON text that is read [byte]: 64 MiB, some thousand times a usual one."""
 
 
-def parse_object(data: bytes | str, where: str) -> dict[str, Any]:
+def parse_object(data: bytes | str, where: str, *, not_finite: bool = False) -> dict[str, Any]:
     """Return the JSON object in a text.
 
     Args:
         data: the text.
         where: what it is, for messages.
+        not_finite: take NaN and Infinity, which are no JSON and which many programs write, as numbers.
 
     Raises:
-        RecordingError: no JSON, NaN or Infinity in it, nested too deeply, too long, or no object.
+        RecordingError: no JSON, NaN or Infinity in it that is not taken, nested too deeply, too long, or no object.
     """
     if len(data) > MAX_JSON_BYTES:
         raise RecordingError(f"{where} is JSON of {len(data)} bytes; at most {MAX_JSON_BYTES} are read.")
     try:
-        value = json.loads(data, parse_constant=_refuse_constant)
+        value = json.loads(data, parse_constant=float if not_finite else _refuse_constant)
     except (ValueError, RecursionError) as failure:
         raise RecordingError(f"{where} is not JSON ({failure}): {quoted(data)}") from failure
     if not isinstance(value, dict):

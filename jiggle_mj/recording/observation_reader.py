@@ -87,12 +87,17 @@ class ObservationReader:
         return None
 
     def _force(self, stamp: int, tool: ToolState) -> MeasuredForce | None:
-        """Return the latest force up to the tolerance of poses before a frame, in the world."""
+        """Return the latest force up to the tolerance of poses before a frame, in the world.
+
+        None where it is old, or no number: then an earlier one would be of another frame.
+        """
         forces = self.contents.forces
         place = bisect_right(forces, stamp + self.tolerance, key=lambda force: force.time)
         if not place or stamp - forces[place - 1].time > self.max_pose_age:
             return None
         force = forces[place - 1]
+        if not force.is_measured:
+            return None
         if force.frame_id == TOOL:
             rotation = Rotation.from_quat(tool.quat_wxyz, scalar_first=True).as_matrix()
         else:

@@ -106,6 +106,12 @@ class Recording:
         return self._reader.why_no_force
 
     @property
+    def lost_forces(self) -> tuple[int, int]:
+        """How many forces on the tool are not three finite numbers, and how many the file holds."""
+        forces = self._contents.forces
+        return sum(not force.is_measured for force in forces), len(forces)
+
+    @property
     def seed(self) -> int | None:
         """Return the seed that the metadata state; None where they state none, as a secret scene's."""
         text = self.metadata.get("seed", "")

@@ -17,7 +17,7 @@ from ..errors import OptionError
 from ..observation import Declaration, MeasuredPoints, Observation
 from .declaration import METADATA, file_metadata, write_declaration
 from .events import EVENT_SCHEMA, event_json
-from .force import FORCE_SCHEMA, NO_TORQUE, ToolForce, force_json
+from .force import FORCE_SCHEMA, NO_TORQUE, UNMEASURED, ToolForce, force_json
 from .frames import camera_transforms
 from .mcap_files import McapOutput
 from .schemas import (
@@ -62,7 +62,7 @@ class RecordingWriter:
         as_instance(declaration, "declaration", Declaration)
         if not all(isinstance(text, str) for text in (*as_instance(metadata, "metadata", dict), *metadata.values())):
             raise OptionError(f"metadata must be a dict of texts; got {quoted(metadata)}.")
-        self._camera = camera
+        self._camera, self._forces_began = camera, False
         self._output = McapOutput(path, overwrite=overwrite)
         self._output.metadata(METADATA, file_metadata() | metadata)
         write_declaration(self._output, declaration)
@@ -101,11 +101,11 @@ class RecordingWriter:
             output.message(RIGHT, time, image_message(time, observation.images.right, "right"))
         if observation.points is not None:
             output.message(POINTS, time, _points_message(time, observation.points))
-        if observation.force is not None:
-            x, y, z = observation.force.on_tool.tolist()
-            self.write_force(
-                ToolForce(time=time, force=(x, y, z), torque=NO_TORQUE, frame_id=WORLD, sd=observation.force.sd)
-            )
+        measured = observation.force
+        if measured is not None or self._forces_began:  # else the force of the frame before would be read in this one
+            x, y, z = UNMEASURED if measured is None else measured.on_tool.tolist()
+            sd, self._forces_began = None if measured is None else measured.sd, True
+            self.write_force(ToolForce(time=time, force=(x, y, z), torque=NO_TORQUE, frame_id=WORLD, sd=sd))
         output.flush()
 
     def write_force(self, force: ToolForce) -> None:

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.force_sensor import MIN_OPEN, ForceSensor
+from jiggle_mj.estimator.force_sensor import ForceSensor
+from jiggle_mj.force_scatter import MIN_OPEN
 from jiggle_mj.observation import MeasuredForce, Observation
 from tests.support.recordings import tool
 
@@ -37,6 +38,13 @@ def test_offset_and_noise_are_those_with_open_jaws():
     found = np.sqrt(np.diagonal(force.covariance))
     np.testing.assert_allclose(found, SD, rtol=3 / (2 * 150) ** 0.5)
     assert float(force.offset_sd) == pytest.approx(found[0] / 50**0.5)
+
+
+def test_more_noise_with_open_jaws_than_is_stated_counts():
+    """From 50 frames it is known to 6 %: three standard errors are 17 %."""
+    force = readings(50, sd=SD / 1000)
+    assert force is not None
+    np.testing.assert_allclose(np.sqrt(np.diagonal(force.covariance)), SD, rtol=0.2)
 
 
 def test_a_stated_noise_counts_and_too_few_frames_say_nothing():

@@ -220,9 +220,7 @@ def _forces(survey: BagSurvey, world: str, sd: float | None, notes: list[str]) -
     for number in times.order:
         message, time = survey.messages["force"][number], times.stamps[number]
         force, torque = (np.array([each.x, each.y, each.z]) for each in (message.wrench.force, message.wrench.torque))
-        if not np.isfinite(force).all():
-            n_without += 1
-            continue
+        n_without += not np.isfinite(force).all()
         frame, found = frame_name(message.header.frame_id) or world, joined
         try:
             rotation = survey.tree.T_world(frame, world, time, times.topic)[:3, :3]
@@ -235,7 +233,9 @@ def _forces(survey: BagSurvey, world: str, sd: float | None, notes: list[str]) -
         u, v, w = (rotation @ torque).tolist() if np.isfinite(torque).all() else NO_TORQUE
         found.append(ToolForce(time=time, force=(x, y, z), torque=(u, v, w), frame_id=frame, sd=sd))
     if n_without:
-        notes.append(f"{times.topic}: {n_without} of {len(times.order)} forces are not finite, and are left out")
+        notes.append(
+            f"{times.topic}: {n_without} of {len(times.order)} forces are not finite, and count as not measured"
+        )
     for frame, count in Counter(force.frame_id for force in apart).items():
         notes.append(
             f"{times.topic}: {count} forces are not used: /tf does not join '{frame}' to '{world}' at their time"

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from jiggle_mj.errors import ObservationError, RecordingError
 from jiggle_mj.observation import Declaration, MeasuredForce, ToolState
 from jiggle_mj.plausibility.force_problems import force_problems
-from jiggle_mj.recording.force import FORCE_SCHEMA, TOOL, ToolForce
+from jiggle_mj.recording.force import FORCE_SCHEMA, TOOL, UNMEASURED, ToolForce, force_json, parse_force
 from jiggle_mj.recording.frames import camera_transforms
 from jiggle_mj.recording.reader import Recording
 from jiggle_mj.recording.schemas import frame_transform
@@ -27,8 +27,13 @@ def test_a_force_is_read_as_it_was_written(tmp_path):
     with RecordingWriter(path, camera=camera(), declaration=Declaration(), metadata={}) as writer:
         for each in seen:
             writer.write(each)
-    forces = [each.force for each in Recording.open(path)]
-    assert forces[1] is None and [force.sd for force in forces if force] == [0.02, 0.02]
+    recording = Recording.open(path, pose_age_ns=10**12)  # so that the force of the frame before is not too old
+    forces = [each.force for each in recording]
+    assert (
+        recording.lost_forces == (1, 3)
+        and forces[1] is None
+        and [force.sd for force in forces if force] == [0.02, 0.02]
+    )
     np.testing.assert_array_equal(forces[2].on_tool, ON_TOOL)
 
 
@@ -44,13 +49,12 @@ def recorded(path, *forces: ToolForce) -> Recording:
         bag.tool(time)
         bag.pair(time)
     for force in forces:
-        message = {"force": list(force.force), "torque": [0, 0, 0], "frame_id": force.frame_id}
-        bag.output.json(FORCE, force.time, message, schema=FORCE_SCHEMA)
+        bag.output.json(FORCE, force.time, force_json(force), schema=FORCE_SCHEMA)
     bag.output.close()
     return Recording.open(path)
 
 
-def measured(time: int, frame: str, force=(1.0, 2.0, 3.0)) -> ToolForce:
+def measured(time: int, frame: str, force: tuple[float, float, float] = (1.0, 2.0, 3.0)) -> ToolForce:
     return ToolForce(time=time, force=force, torque=(0.0, 0.0, 0.0), frame_id=frame)
 
 
@@ -62,6 +66,46 @@ def test_the_latest_force_counts_in_the_axes_of_the_world_or_of_the_tool(tmp_pat
     turned = Rotation.from_quat(tool().quat_wxyz, scalar_first=True).apply([1, 2, 3])
     np.testing.assert_allclose(second.on_tool, turned, atol=1e-11)  # the quaternion is rounded to twelve decimals
     assert first.sd is None and recording.why_no_force is None
+
+
+def test_a_force_that_is_no_number_is_none_in_its_frame_and_is_counted(tmp_path):
+    """An earlier force does not stand for it."""
+    recording = recorded(tmp_path / "run.mcap", measured(0, "world"), measured(10 * MS, "world", UNMEASURED))
+    first, second = (each.force for each in recording)
+    assert second is None
+    np.testing.assert_array_equal(first.on_tool, [1, 2, 3])
+    (problem,) = force_problems(recording, [])
+    assert problem.name == "force-missing" and not problem.refuses and problem.text.startswith("1 of 2 forces")
+
+
+@pytest.mark.parametrize("lost", ["NaN", "Infinity", "-Infinity", "null"])
+def test_what_programs_write_for_no_number_is_read(lost):
+    """Also of a torque, which nothing is computed from."""
+    message = f'{{"force": [0.5, {lost}, 1], "torque": [0, 0, {lost}], "frame_id": "world"}}'.encode()
+    found = parse_force(message, 0)
+    assert not found.is_measured and found.torque == (0, 0, 0)
+    with pytest.raises(RecordingError, match="force"):
+        parse_force(message.replace(b"0.5", b'"0.5"'), 0)
+
+
+def test_a_recording_whose_forces_are_all_lost_is_refused(tmp_path):
+    (problem,) = force_problems(recorded(tmp_path / "run.mcap", measured(0, "world", UNMEASURED)), [])
+    assert problem.name == "force-missing" and problem.refuses
+
+
+@pytest.mark.parametrize(("stated", "doubted"), [(1e-3, True), (1.0, False), (1.4, False), (4.0, True), (1e3, True)])
+def test_a_stated_noise_of_the_force_that_open_jaws_contradict_is_doubted(tmp_path, stated, doubted):
+    """Stated in multiples of the true one; 20 open frames give it to a tenth."""
+    noise, offset = np.random.default_rng(1), np.array([0.3, 0.1, 1.0])
+    frames = [
+        (
+            replace(tool(), closed=False),
+            MeasuredForce(on_tool=offset + noise.normal(size=3) * SENSOR_SD, sd=stated * SENSOR_SD),
+        )
+        for _ in range(20)
+    ]
+    found = list(force_problems(recorded(tmp_path / "run.mcap", measured(0, "robot")), frames))
+    assert [problem.name for problem in found] == ["force-noise"] * doubted
 
 
 def test_a_force_in_an_unknown_frame_is_left_out_and_named(tmp_path):
