@@ -12,6 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar, Generic, TypeVar
 
+from jiggle_mj.episode import ESTIMATE, RECORDING, RESULT, check_directory
+from jiggle_mj.errors import OutputError
+
 Cell = TypeVar("Cell", bound=Hashable)
 Result = TypeVar("Result")
 
@@ -93,8 +96,12 @@ def run_study(
         log: gets a line for each cell: before it starts in this process, after it is done in an executor.
 
     Raises:
+        OutputError: the directory is a file, or holds the results of a run.
         Exception: whatever the first cell that fails raises; what is finished stays.
     """
+    check_directory(directory, (), overwrite=False)
+    if held := [name for name in (RECORDING, ESTIMATE, RESULT) if (directory / name).exists()]:
+        raise OutputError(f"{directory} holds {', '.join(held)} of a run; a table needs a folder of its own.")
     paths = {cell: directory / study.name(cell) for cell in cells}
     missing = {
         path.name: partial(study.run_cell, cell, path)

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import pytest
 
+from jiggle_mj.errors import OutputError
 from jiggle_mj.eval.studies.figures import mean_and_range, value
 from jiggle_mj.eval.studies.study import Study, Table, run_study
 
@@ -52,6 +53,16 @@ def executor(request):
     else:
         with ThreadPoolExecutor(1) as threads:
             yield threads
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "estimate.mcap", "result.json"])
+def test_a_folder_of_a_run_and_a_file_are_no_place_for_a_table(tmp_path: Path, name: str):
+    (tmp_path / name).write_text("kept")
+    with pytest.raises(OutputError, match=f"holds {name} of a run; a table needs a folder of its own"):
+        run_study(Squares(), (0, 1), tmp_path)
+    with pytest.raises(OutputError, match="is a file"):
+        run_study(Squares(), (0, 1), tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_what_is_current_is_not_run_again(tmp_path: Path, executor: Executor | None):
