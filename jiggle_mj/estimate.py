@@ -120,12 +120,21 @@ class KeptFrames:
     """Particles that the grip may pull at, the held ones included."""
     fields: Float[np.ndarray, "n m"] | None = None
     """The noise that neighbours share as fields, the same in all frames [m]; None where no noise is shared."""
+    force_index: Int[np.ndarray, " p"]
+    """Which of the frames have a measured force, rising."""
+    pull: Float[np.ndarray, "p 3"]
+    """Measured force of the tool on the tissue in these [N]."""
+    pull_covariance: Float[np.ndarray, "p 3 3"]
+    """Covariance of its noise [N^2]; NaN where it is not known."""
+    offset_sd: Float[np.ndarray, " p"]
+    """Standard deviation of each component of the sensor's offset [N]; NaN where it is not known."""
+    offset_number: Int[np.ndarray, " p"]
+    """Number of that offset, whose error those of the same number share."""
 
     @property
     def nbytes(self) -> int:
         """Return the memory of the arrays [byte]."""
-        arrays = (self.grasp, self.x, self.y, self.precision, self.held, self.force_unknown, self.fields)
-        return sum(0 if array is None else array.nbytes for array in arrays)
+        return sum(array.nbytes for array in vars(self).values() if array is not None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +149,8 @@ class Belief:
     """Stiffness b at which s = 1/2 [N/m]; None where the Gaussian is over b."""
     lower: Float[np.ndarray, " n"] | None = None
     """Lower end of each particle's marginal 90 % credible interval of b [N/m]: 0 where b = 0 cannot be excluded. None
-    where it is not computed, as for a Gaussian over b."""
+    where it is not computed, as for a Gaussian over b. Where P(attached) is small the mean of b may lie above the
+    interval: most of the probability is at 0, and the mean is pulled up by the stiffnesses that are unlikely."""
     upper: Float[np.ndarray, " n"] | None = None
     """Upper end of that interval [N/m]; infinite where only a lower end is known."""
 

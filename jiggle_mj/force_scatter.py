@@ -21,6 +21,8 @@ class ForceScatter:
         """Mean of the latest stretch [N]; 0 before any."""
         self.offset_share = 0.0
         """Variance of that mean over that of one force [1]."""
+        self.offset_number = 0
+        """How many stretches there were: frames of the same number share the error of the offset."""
         self._open, self._squares, self._degrees = list[Float[np.ndarray, " 3"]](), 0.0, 0
 
     def add(self, on_tool: Float[np.ndarray, " 3"]) -> None:
@@ -32,6 +34,7 @@ class ForceScatter:
         if self._open:
             values = np.array(self._open)
             self.offset, self.offset_share = values.mean(axis=0), 1 / len(values)
+            self.offset_number += 1
             self._squares += float(np.sum((values - self.offset) ** 2))
             self._degrees += 3 * (len(values) - 1)
             self._open = []

@@ -9,12 +9,12 @@ from jaxtyping import Float, PRNGKeyArray
 
 from jiggle_mj.estimate import KeptFrames
 
-from .evidence import Evidence
+from .evidence import Evidence, MeasuredPull
 from .filter import FilterState
 from .grasp import GraspFrame, GraspFrames
 from .implicit import ImplicitFilter, ImplicitState
 
-STORED = ("y", "precision", "held", "force_unknown", "fields")
+STORED = ("y", "precision", "held", "force_unknown", "fields", "force")
 """Parts of a frame's evidence that are kept."""
 NOT_NEEDED = ("pull",)
 """Parts that this filter does not use."""
@@ -37,6 +37,7 @@ def kept_frames(state: FilterState) -> KeptFrames | None:
         return np.array([np.asarray(getattr(frame.evidence, name)) for _, frame in frames])
 
     shared = frames[0][1].evidence.fields
+    forces = [(k, force) for k, (_, frame) in enumerate(frames) if (force := frame.evidence.force) is not None]
     return KeptFrames(
         grasp=np.array([k for k, _ in frames]),
         x=np.array([np.asarray(frame.x) for _, frame in frames]),
@@ -45,6 +46,11 @@ def kept_frames(state: FilterState) -> KeptFrames | None:
         held=stacked("held"),
         force_unknown=stacked("force_unknown"),
         fields=None if shared is None else np.asarray(shared),
+        force_index=np.array([k for k, _ in forces], int),
+        pull=np.array([force.pull for _, force in forces]).reshape(-1, 3),
+        pull_covariance=np.array([force.covariance for _, force in forces]).reshape(-1, 3, 3),
+        offset_sd=np.array([float(force.offset_sd) for _, force in forces], float),
+        offset_number=np.array([int(force.offset_number) for _, force in forces], int),
     )
 
 
@@ -60,6 +66,16 @@ def resumed(filter: ImplicitFilter, key: PRNGKeyArray, frames: KeptFrames, b: Fl
     shared = None if frames.fields is None else jnp.asarray(frames.fields)
     state = filter.init(key)
     s = state.belief.bounded(jnp.asarray(b))
+    forces = {
+        int(k): MeasuredPull(
+            index=jnp.asarray(k),
+            pull=jnp.asarray(frames.pull[i]),
+            covariance=jnp.asarray(frames.pull_covariance[i]),
+            offset_sd=jnp.asarray(frames.offset_sd[i]),
+            offset_number=jnp.asarray(frames.offset_number[i]),
+        )
+        for i, k in enumerate(frames.force_index)
+    }
 
     def frame(k: int) -> GraspFrame:
         evidence = Evidence(
@@ -68,6 +84,7 @@ def resumed(filter: ImplicitFilter, key: PRNGKeyArray, frames: KeptFrames, b: Fl
             held=jnp.asarray(frames.held[k]),
             force_unknown=jnp.asarray(frames.force_unknown[k]),
             fields=shared,
+            force=forces.get(k),
         )
         return GraspFrame(evidence=evidence, x=jnp.asarray(frames.x[k]), s=s)
 

@@ -14,13 +14,16 @@ KEPT_FRAMES = "frames.npz"
 """Attachment."""
 MAX_KEPT_BYTES = 1 << 28
 """Largest size of the frames in memory that is stored [byte]: half of the largest attachment that is read."""
+FORCES = ("force_index", "pull", "pull_covariance", "offset_sd", "offset_number")
+NAMES = ("grasp", "x", "y", "held", "force_unknown", *FORCES)
+"""Arrays that are stored as they are; the former are those of the measured forces."""
 ROW, COLUMN = np.triu_indices(3)
 """Places of the six stored numbers of a precision."""
 
 
 def frames_to_arrays(frames: KeptFrames) -> dict[str, np.ndarray]:
     """Return the arrays by name."""
-    arrays = {name: getattr(frames, name) for name in ("grasp", "x", "y", "held", "force_unknown")}
+    arrays = {name: getattr(frames, name) for name in NAMES}
     arrays["precision"] = frames.precision[:, :, ROW, COLUMN]
     return arrays if frames.fields is None else arrays | {"fields": frames.fields}
 
@@ -43,6 +46,10 @@ def frames_from_arrays(arrays: StoredArrays, n: int, where: str) -> KeptFrames:
     precision[:, :, ROW, COLUMN] = precision[:, :, COLUMN, ROW] = stored
     if f == 0 or (np.diff(grasp) < 0).any() or (stored[:, :, ROW == COLUMN] < 0).any():
         raise RecordingError(f"{where} is damaged: it holds no frames in order, with precisions; estimate again.")
+    force_index = arrays.indices("force_index", (None,), below=f)
+    p = len(force_index)
+    if (np.diff(force_index) <= 0).any():
+        raise RecordingError(f"{where} is damaged: its forces are not in order; estimate again.")
     return KeptFrames(
         grasp=grasp,
         x=arrays.positions("x", (f, n, 3), finite=True),
@@ -51,4 +58,9 @@ def frames_from_arrays(arrays: StoredArrays, n: int, where: str) -> KeptFrames:
         held=arrays.flags("held", (f, n)),
         force_unknown=arrays.flags("force_unknown", (f, n)),
         fields=arrays.positions("fields", (n, None), finite=True) if "fields" in arrays else None,
+        force_index=force_index,
+        pull=arrays.numbers("pull", (p, 3), finite=True),
+        pull_covariance=arrays.numbers("pull_covariance", (p, 3, 3)),
+        offset_sd=arrays.numbers("offset_sd", (p,)),
+        offset_number=arrays.indices("offset_number", (p,), below=np.iinfo(np.int32).max),
     )

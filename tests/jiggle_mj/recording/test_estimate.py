@@ -111,6 +111,11 @@ def kept() -> KeptFrames:
         held=generator.uniform(size=(3, N)) > 0.5,
         force_unknown=generator.uniform(size=(3, N)) > 0.5,
         fields=generator.normal(size=(N, 2)),
+        force_index=np.array([0, 2]),
+        pull=generator.normal(size=(2, 3)),
+        pull_covariance=np.stack([np.eye(3), np.full((3, 3), np.nan)]),
+        offset_sd=np.array([0.1, np.nan]),
+        offset_number=np.array([0, 1]),
     )
 
 
@@ -136,6 +141,9 @@ def test_kept_frames_are_read_back_exactly(tmp_path, changes):
         {"grasp": np.array([1, 0, 1])},
         {"x": np.full((3, N, 3), np.nan)},
         {"precision": -kept().precision},
+        {"force_index": np.array([0, 3])},
+        {"force_index": np.array([1, 1])},
+        {"pull": np.full((2, 3), np.nan)},
     ],
 )
 def test_damaged_frames_are_refused(tmp_path, changes):
