@@ -14,6 +14,7 @@ from ..recording.force import MAX_FORCE_N
 from ..toml_kinds import StrictTable
 from .data_folder import DataFolder, quoted
 from .points.archives import read_array
+from .points.headings import FORCES, stated_units
 from .points.text_lines import read_lines
 from .points.text_table import TextTable
 from .units import unit_of
@@ -22,8 +23,6 @@ FORCE_UNITS = {"N": 1.0, "mN": 1e-3, "cN": 1e-2}
 """Newtons in one unit of force."""
 AXIS = re.compile(r"(?:^|[\W_])(?:f|force)?[\W_]?([xyz])(?=$|[\W_])", re.IGNORECASE)
 """An axis in a heading: Fx, force_x, F.x [mN]."""
-STATED = re.compile(r"[\[(]\s*(m?N|cN|kN|gf|kgf|lbf)\s*[\])]|[\s_](mN|cN|kN|gf|kgf|lbf)$")
-"""A unit of force in a heading or the name of an array: `Fx [N]`, `force_mN`. `force_n` may be a normal force."""
 ACTS_ON = ("on tool", "on tissue")
 """On which of the two a force may act, that on the tool by default."""
 
@@ -38,10 +37,15 @@ class GivenForce:
     """Text file of three columns, one row a frame; None where an array is given."""
     unit: str
     """Unit of the data, a key of `FORCE_UNITS`."""
-    factor: float
-    """Newtons in one unit of the data, negative where the force is that on the tissue."""
+    on_tissue: bool
+    """Whether it is the force on the tissue, and not on the tool."""
     sd: float | None
     """Standard deviation of each component [N]; None where it is not known."""
+
+    @property
+    def factor(self) -> float:
+        """Return the newtons on the tool in one unit of the data."""
+        return FORCE_UNITS[self.unit] * (-1 if self.on_tissue else 1)
 
 
 def read_force_table(table: StrictTable) -> GivenForce | None:
@@ -55,11 +59,12 @@ def read_force_table(table: StrictTable) -> GivenForce | None:
     on = table.take("acts", kinds.text, ACTS_ON[0])
     if on not in ACTS_ON:
         raise RecordingError(f"{table.where} acts must be one of {', '.join(map(repr, ACTS_ON))}; got '{on[:50]}'.")
+    unit_of(table, "unit", FORCE_UNITS)
     force = GivenForce(
         values=table.take("values", kinds.text, None),
         file=table.take("file", kinds.text, None),
         unit=table.take("unit", kinds.text, ""),
-        factor=unit_of(table, "unit", FORCE_UNITS) * (1 if on == ACTS_ON[0] else -1),
+        on_tissue=on == ACTS_ON[1],
         sd=table.take("sd", kinds.positive, None),
     )
     table.refuse_unknown()
@@ -126,9 +131,7 @@ def _refuse_names(given: GivenForce, names: Sequence[str], where: str, units: Se
     Raises:
         RecordingError: they do.
     """
-    found = [match for name in (*names, *units) if (match := STATED.search(name.strip(' "')))]
-    others = {unit for match in found for unit in match.groups() if unit} - {given.unit}
-    if others:
+    if others := stated_units((*names, *units), FORCES) - {given.unit}:
         stated = ", ".join(sorted(others))
         raise RecordingError(
             f'unit = "{given.unit}", but {where} says that forces are in {stated}: give that unit in [force], one of '

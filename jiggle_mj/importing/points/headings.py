@@ -2,20 +2,43 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 UNIT_WORDS = frozenset("m mm cm um µm μm px pix pixel pixels s ms n mn cn kn deg rad 1 - % none".split()) | {""}
 """What a line of units below a heading holds, without its brackets."""
 PIXELS = "pixels"
 """The unit of coordinates in an image, which are no lengths."""
-LENGTHS = {
-    "m": ("m", "meter", "meters", "metre", "metres"),
-    "cm": ("cm", "centimeters", "centimetres"),
-    "mm": ("mm", "millimeters", "millimetres"),
-    "um": ("um", "µm", "μm", "micron", "microns", "micrometers", "micrometres"),
-    "inches": ("in", "inch", "inches"),
-    PIXELS: ("px", "pix", "pixel", "pixels"),
-}
-"""Words for units of length, and for what is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnitWords:
+    """How headings, and the names of arrays, state units of one quantity."""
+
+    in_brackets: dict[str, tuple[str, ...]]
+    """Words of each unit in brackets, in lower case."""
+    at_the_end: frozenset[str]
+    """Those that count without brackets at the end of a name as well."""
+
+
+LENGTHS = UnitWords(
+    in_brackets={
+        "m": ("m", "meter", "meters", "metre", "metres"),
+        "cm": ("cm", "centimeters", "centimetres"),
+        "mm": ("mm", "millimeters", "millimetres"),
+        "um": ("um", "µm", "μm", "micron", "microns", "micrometers", "micrometres"),
+        "inches": ("in", "inch", "inches"),
+        PIXELS: ("px", "pix", "pixel", "pixels"),
+    },
+    at_the_end=frozenset("um µm μm mm cm px pix pixel pixels".split()),
+)
+"""Units of length, and what is none. A name that ends in `_m` states none: that may mean marker, mean or measured."""
+FORCES = UnitWords(
+    in_brackets={unit: (unit.lower(),) for unit in ("N", "mN", "cN", "kN", "gf", "kgf", "lbf")},
+    at_the_end=frozenset("mn cn kn gf kgf lbf".split()),
+)
+"""Units of force. A name that ends in `_n` states none: that may be a normal force."""
+BRACKETED = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
+"""What stands in brackets."""
 IN_BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 """A name with a unit in brackets, as `X [mm]`."""
 AFTER_NAME = re.compile(r"^(?P<name>.+?)[_ ](?P<unit>um|µm|μm|mm|cm|m|px|pix|pixels?)$", re.IGNORECASE)
@@ -38,21 +61,17 @@ def plain_heading(name: str) -> str:
     return (match["name"] if match else "") or text.split("[")[0].split("(")[0].strip() or text
 
 
-def stated_unit(name: str) -> str | None:
-    """Return the unit of length that a heading or the name of an array states, a key of `LENGTHS`; None for none.
-
-    A name that ends in `_m` states none: that may mean marker, mean or measured.
-    """
+def stated_unit(name: str, kind: UnitWords = LENGTHS) -> str | None:
+    """Return the unit that a heading or the name of an array states, a key of `kind.in_brackets`; None for none."""
     text = name.strip(' "').lower()
-    match = IN_BRACKETS.match(text) or AFTER_NAME.match(text)
-    if match is None or (match.re is AFTER_NAME and match["unit"] == "m"):
-        return None
-    return next((unit for unit, words in LENGTHS.items() if match["unit"].strip() in words), None)
+    *before, last = re.split(r"[_\s]", text)
+    words = [*BRACKETED.findall(text), *([last] if before and last in kind.at_the_end else [])]
+    return next((unit for word in words for unit, names in kind.in_brackets.items() if word in names), None)
 
 
-def stated_units(names: Iterable[str]) -> frozenset[str]:
-    """Return the units of length that names state."""
-    return frozenset(unit for name in names if (unit := stated_unit(name)) is not None)
+def stated_units(names: Iterable[str], kind: UnitWords = LENGTHS) -> frozenset[str]:
+    """Return the units that names state."""
+    return frozenset(unit for name in names if (unit := stated_unit(name, kind)) is not None)
 
 
 def frame_columns(names: Sequence[str]) -> list[int]:
