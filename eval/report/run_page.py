@@ -102,6 +102,8 @@ def write_report(
     page.filters.update(number=_text, percent=_percent, milli=_milli)
     comparison = None
     sentences = [found(sheet, detection, plane_of(sheet.rest))]
+    if skipped := result["frames"]["skipped"]:
+        sentences.append(f"{len(skipped)} of {result['n_frames']} frames are left out.")
     if truth is not None and transferred is not None:
         comparison = _comparison(sheet, estimates, detection, truth, transferred)
         sentences += [
