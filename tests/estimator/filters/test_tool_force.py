@@ -18,6 +18,7 @@ from jiggle_mj.estimator.filters.force_axes import doubt
 from jiggle_mj.estimator.filters.force_evidence import ForceEvidence, LogFactor, StackedForces, fitted
 from jiggle_mj.estimator.filters.force_fit import StiffnessScale
 from jiggle_mj.estimator.filters.implicit import ImplicitFilter
+from jiggle_mj.estimator.filters.kept_frames import kept_frames, resumed
 from jiggle_mj.estimator.filters.posterior_summary import prior_summary
 from jiggle_mj.estimator.filters.tool_force import FRICTION, WEIGHT_ERROR, FrameForce, frame_force
 from jiggle_mj.estimator.perception.mesh_field import MeshField
@@ -325,6 +326,22 @@ def test_a_cut_leaves_the_factor_as_it_was_known(tracked):
     assert before is not None and after is not None
     assert (after.factor, after.log_sd) == pytest.approx((before.factor, before.log_sd))
     assert not after.log_with_s.any()
+
+
+@pytest.mark.slow
+def test_frames_are_kept_with_their_forces():
+    """The noise of a force need not be known."""
+    filter, frames = filter_of(K), slice(0, 2)
+    unknown = eqx.tree_at(lambda e: e.force.covariance, measured()[1], jnp.full((3, 3), jnp.nan))
+    state, *_ = follow(filter, lifts()[frames], [measured()[0], unknown])
+    kept = kept_frames(state)
+    assert kept is not None and kept.force_index.tolist() == [0, 1]
+    again = resumed(filter, state.key, kept, np.asarray(state.summary.b))
+    found = [frame.evidence.force for grasp in again.grasps for frame in grasp.frames]
+    for force, given in zip(found, (measured()[0].force, unknown.force), strict=True):
+        assert force is not None and given is not None
+        for name in ("pull", "covariance", "offset_sd", "offset_number"):
+            np.testing.assert_array_equal(getattr(force, name), getattr(given, name))
 
 
 @pytest.mark.slow
