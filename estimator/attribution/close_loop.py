@@ -91,7 +91,7 @@ def close_the_loop(
         log(f"{len(dataset.left_out)} frames excluded: the held particles are observed in another shape there")
     log(f"fitting {len(problem.frames(used))} frames in {len(used)} parts with the declared model")
     steps, refused = _search(problem, _declared(problem, dataset, used, log), used, log)
-    predicted, most = list[HeldOut](), len(steps[-1].added)
+    predicted = list[HeldOut]()
     if spare is not None:
         predicted = [predict_held_out(problem, step.context.fitted, spare) for step in steps]
         steps, predicted, dropped = carried_over(steps, predicted)
@@ -108,8 +108,8 @@ def close_the_loop(
     left = remainder_of_fit(problem, last.fitted)
     with_remainder = None if spare is None else predicted[-1].beyond(*left.of(problem.history.frames, spare))
     folds = [HeldOut.together(last.folds)] if last.folds else []
-    unexplained = last.unexplained.gain > MAX_UNEXPLAINED_GAIN or len(accepted) < most
-    unexplained |= any(one.excess > MAX_EXCESS for one in folds + predicted[-1:])
+    too_large = any(one.excess > MAX_EXCESS for one in folds + predicted[-1:])
+    unexplained = too_large or last.unexplained.gain > MAX_UNEXPLAINED_GAIN
     verdict, final = _verdict(accepted, rivals, unexplained), last.fitted
     if verdict in UNEXPLAINED and folds:
         excess = max(folds[0].excess, 1.0)

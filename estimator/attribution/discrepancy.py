@@ -2,12 +2,16 @@
 
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from .close_loop import Closed
 from .dataset import Dataset
+from .held_out import rms
 from .hypotheses import Hypothesis, reported_sd
 from .localisation import localisation
 from .suggestion import Suggestion
-from .trivial_predictions import trivial_predictions
+from .trivial_predictions import TRIVIAL, trivial_predictions
 
 
 def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
@@ -46,8 +50,7 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
                 {"before_rms_m": before.rms, "after_rms_m": after.rms}
                 for before, after in zip(first.folds, last.folds, strict=True)
             ],
-            **_reported(closed),
-            **_trivial(closed, dataset),
+            **_reported(closed, dataset),
         },
         "remainder": {
             "degrees": closed.remainder.degrees,
@@ -83,14 +86,6 @@ def _effect(closed: Closed, one: Hypothesis, rivals: list[Hypothesis]) -> dict[s
     }
 
 
-def _trivial(closed: Closed, dataset: Dataset) -> dict[str, float | None]:
-    """Return the errors without a model for the part that chose no effect."""
-    if closed.reported is None:
-        return dict.fromkeys(("unmoved_rms_m", "last_frame_rms_m", "in_proportion_rms_m"))
-    errors = trivial_predictions(dataset.frames, dataset.frames[-1].part)
-    return {f"{name}_rms_m": error for name, error in errors.items()}
-
-
 def suggested(found: Suggestion) -> dict[str, Any]:
     """Return the content of `suggestion`."""
     return {
@@ -103,12 +98,29 @@ def suggested(found: Suggestion) -> dict[str, Any]:
     }
 
 
-def _reported(closed: Closed) -> dict[str, float | None]:
-    """Return the figures of the part that chose no effect; None without one."""
-    figures: dict[str, float | None] = {}
+def _reported(closed: Closed, dataset: Dataset) -> dict[str, Any]:
+    """Return the figures of the part that chose no effect, and its error in each frame; None without one."""
     before, after = closed.reported or (None, None)
-    for when, found in (("before", before), ("after", after), ("with_remainder", closed.with_remainder)):
+    predictions = {"before": before, "after": after, "with_remainder": closed.with_remainder}
+    figures: dict[str, Any] = {}
+    for when, found in predictions.items():
         figures[f"{when}_rms_m"] = None if found is None else found.rms
         figures[f"{when}_nll"] = None if found is None else found.nll
         figures[f"{when}_coverage_90"] = None if found is None else found.coverage_90
+    if closed.reported is None:
+        return figures | dict.fromkeys(f"{name}_rms_m" for name in TRIVIAL) | {"frames": []}
+    of_part = [timed for timed in dataset.frames if timed.part == dataset.frames[-1].part]
+    ends = np.cumsum([int(timed.frame.counted.sum()) for timed in of_part])[:-1]
+    residuals = {when: np.split(found.residual, ends) for when, found in predictions.items() if found is not None}
+    trivial = trivial_predictions(dataset.frames, of_part[0].part)
+    figures |= {f"{name}_rms_m": rms(np.concatenate(trivial[name])) for name in TRIVIAL}
+    residuals |= trivial
+    figures["frames"] = [
+        {"index": timed.index} | {f"{name}_rms_m": _rms(found[k]) for name, found in residuals.items()}
+        for k, timed in enumerate(of_part)
+    ]
     return figures
+
+
+def _rms(residual: Float[np.ndarray, "m 3"]) -> float | None:
+    return rms(residual) if len(residual) else None

@@ -6,15 +6,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .grasped_frames import ClosedFrame, Timed
-from .held_out import rms
 
+TRIVIAL = ("unmoved", "last_frame", "in_proportion")
+"""Names of the predictions."""
 RIDGE = 1e-3
 """Prior precision of the matrix of a particle about its scalar share, over the largest square of a displacement: it
 decides in directions in which nothing was pulled."""
 
 
-def trivial_predictions(frames: list[Timed], part: int) -> dict[str, float]:
-    """Return the root mean square error of a part's frames by each prediction without a model [m].
+def trivial_predictions(frames: list[Timed], part: int) -> dict[str, list[Float[np.ndarray, "m 3"]]]:
+    """Return the residuals of each frame of a part by each prediction without a model, of what counts [m].
 
     They are: `unmoved`, nothing moved since the jaws closed; `last_frame`, the last frame of the other parts stays; and
     `in_proportion`, each particle moved with the tool by a linear share, a 3 x 3 matrix, that is fitted to the other
@@ -32,9 +33,9 @@ def trivial_predictions(frames: list[Timed], part: int) -> dict[str, float]:
     ridge = (RIDGE * np.max(np.sum(tool**2, axis=1)) + tiny) * np.eye(3)
     share = np.linalg.solve(squared + ridge, product + scalar[:, None, None] * ridge)
     return {
-        "unmoved": _rms([motion.moved[motion.counted] for motion in held]),
-        "last_frame": _rms([(motion.y - last.y)[motion.counted & last.counted] for motion in held]),
-        "in_proportion": _rms([(motion.moved - motion.tool @ share)[motion.counted] for motion in held]),
+        "unmoved": [motion.moved[motion.counted] for motion in held],
+        "last_frame": [(motion.y - last.y)[motion.counted & last.counted] for motion in held],
+        "in_proportion": [(motion.moved - motion.tool @ share)[motion.counted] for motion in held],
     }
 
 
@@ -62,7 +63,3 @@ def _motions(frames: list[Timed]) -> list[_Motion]:
         moved = y - np.asarray(closed.y)
         motions.append(_Motion(part=timed.part, tool=np.asarray(now.displacement), y=y, moved=moved, counted=counted))
     return motions
-
-
-def _rms(residuals: list[Float[np.ndarray, "m 3"]]) -> float:
-    return rms(np.concatenate(residuals))

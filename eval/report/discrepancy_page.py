@@ -31,6 +31,8 @@ TRIVIAL = {
     "in_proportion": "each particle moves in proportion",
 }
 """Predictions without a model, in words."""
+PREDICTED = {"before": BEFORE, "after": AFTER, "last_frame": WITHOUT_MODEL, "with_remainder": "black"}
+"""Colours of the predictions of each frame of the part that chose no effect, by their keys."""
 PAGE_HEIGHT = 1250
 """Height of all pictures [px]."""
 VERDICTS = {
@@ -151,7 +153,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
             "after [mm]",
             "log Bayes factor, one step from the fit [nat]",
             "rank correlation of the residual, before and after",
-            "residual of each fitted frame [mm]",
+            "residual of each frame [mm]; dotted: predicted from the tool's reports alone",
             "held-out parts, then the part that chose no effect [mm]",
         ),
         vertical_spacing=0.1,
@@ -194,6 +196,12 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         bars = go.Bar(x=labels, y=[_in_mm(error) for error in errors], marker={"color": colour}, name=when,
                       showlegend=False)  # fmt: skip
         figure.add_trace(bars, row=3, col=2)
+    for name, colour in PREDICTED.items():
+        errors = [(frame["index"], _in_mm(frame[f"{name}_rms_m"])) for frame in found["held_out"]["frames"]]
+        line = go.Scatter(x=[index for index, _ in errors], y=[error for _, error in errors], mode="lines",
+                          name=TRIVIAL.get(name, name.replace("_", " ")), line={"color": colour, "dash": "dot"},
+                          showlegend=name not in TIMES)  # fmt: skip
+        figure.add_trace(line, row=3, col=1)
     if found["held_out"]["before_rms_m"] is not None:
         others = {"with the remainder": "with_remainder"} | {words: name for name, words in TRIVIAL.items()}
         bars = go.Bar(x=[*others], y=[_in_mm(found["held_out"][f"{name}_rms_m"]) for name in others.values()],
