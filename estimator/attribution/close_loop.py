@@ -15,6 +15,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jiggle_mj.errors import RecordingError
+
 from ..effects import LIBRARY, Effect
 from .dataset import Dataset
 from .fit import MAX_STIFFNESS, Fitted, discounted, fit, start
@@ -80,6 +82,7 @@ def close_the_loop(
         log: receives progress messages.
 
     Raises:
+        RecordingError: the declared model does not predict a frame; see `check_finite`.
         ValueError: an effect that is not of the library cannot be used; see `check_effects`.
     """
     problem = Problem.build(dataset, library)
@@ -170,8 +173,29 @@ def _declared(problem: Problem, dataset: Dataset, used: set[int], log: Callable[
     states = np.array([timed.state for timed in dataset.frames])
     point = start(problem, np.zeros(problem.sheet.size), s, states, problem.frames(used))
     fitted = fit(problem, np.zeros(0, dtype=int), point, used, log=log)
+    check_finite(problem, fitted)
     folds = held_out(problem, leave_one_out(problem, fitted, used))
     return FitContext(fitted=fitted, unexplained=unexplained_residual(problem, fitted), folds=folds, scores=[])
+
+
+def check_finite(problem: Problem, fitted: Fitted) -> None:
+    """Refuse a fit of the declared model that does not predict all of its frames.
+
+    Raises:
+        RecordingError: the normal equations of a frame are not finite.
+    """
+    found = [
+        problem.history.frames[k].index
+        for k, one in fitted.equations.items()
+        if not np.isfinite(np.asarray(one.square)).all()
+    ]
+    if found:
+        raise RecordingError(
+            f"the declared model does not predict {len(found)} of the {len(fitted.equations)} frames that are fitted "
+            f"to, the first is frame {found[0]}: the force balance has no finite solution there. Check the declared "
+            "stiffnesses and the rest shape; a sheet that is seen in one plane alone needs a bending stiffness, a bed "
+            "or gravity that keeps it there."
+        )
 
 
 def _verdict(accepted: list[Hypothesis], rivals: list[list[Hypothesis]], unexplained: bool) -> str:

@@ -3,14 +3,17 @@
 from dataclasses import replace
 from unittest.mock import ANY
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimator.attribution import search
-from jiggle_mj.estimator.attribution.close_loop import SearchStep, carried_over
+from jiggle_mj.estimator.attribution.close_loop import SearchStep, carried_over, check_finite
 from jiggle_mj.estimator.attribution.comparison import against, behind, best, indistinguishable, outdone
 from jiggle_mj.estimator.attribution.held_out import HeldOut, Variances
 from jiggle_mj.estimator.attribution.hypotheses import FitContext, Hypothesis, reported_sd
+from jiggle_mj.estimator.attribution.linear import NormalEquations
 from jiggle_mj.estimator.attribution.scores import Score
 from jiggle_mj.estimator.attribution.unexplained_residual import UnexplainedResidual
 from jiggle_mj.estimator.effects import LIBRARY
@@ -253,3 +256,14 @@ def test_effects_that_predict_the_reported_part_worse_are_taken_out_again():
     assert why.endswith("predicted to 6.60 mm with it and 4.80 mm with what is declared")
     assert carried_over(steps, held_out(4.8, 4.9, 6.6))[0] == steps[:1]
     assert carried_over(steps, held_out(4.8, 4.9, 4.7)) == (steps, ANY, [])
+
+
+def test_a_frame_that_the_declared_model_does_not_predict_is_named():
+    """The problem's only frame is frame 0, and one of its products is no number."""
+    square = np.eye(3)
+    equations = {0: NormalEquations(square=jnp.asarray(square), tool=jnp.zeros((3, 1)))}
+    check_finite(small_problem(), replace(small_fit(), equations=equations))
+    square[1, 1] = np.nan
+    equations = {0: NormalEquations(square=jnp.asarray(square), tool=jnp.zeros((3, 1)))}
+    with pytest.raises(RecordingError, match=r"1 of the 1 frames .* frame 0"):
+        check_finite(small_problem(), replace(small_fit(), equations=equations))
