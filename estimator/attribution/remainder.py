@@ -102,14 +102,14 @@ class FittedRemainder:
 def remainder_of_fit(problem: Problem, fitted: Fitted) -> FittedRemainder:
     """Return the remainder of a fit, given the frames that it was fitted to.
 
-    All frames are predicted from the tool's reports, as held-out ones are.
+    These are predicted from the tool's reports, as held-out ones are.
     """
-    frames = problem.history.frames
-    predicted = from_rest(problem, fitted.point, list(range(len(frames))), by_tool=True)
+    frames, known = problem.history.frames, sorted(fitted.equations)
+    predicted = from_rest(problem, fitted.point, known, by_tool=True)
     return remainder(
         frames,
         np.array([np.asarray(timed.frame.y) for timed in frames]) - predicted.seen,
-        np.isin(np.arange(len(frames)), list(fitted.equations)),
+        np.isin(np.arange(len(frames)), known),
         noise=np.array([noise_variance(problem, timed.frame) for timed in frames]),
     )
 
