@@ -43,7 +43,7 @@ versions:
 	done
 
 slow: $(SET_UP)
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest -m slow -o faulthandler_timeout=0
 
 check: lint types test
 

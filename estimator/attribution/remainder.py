@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import minimize
 
+from ..map_rows import map_rows
 from .fit import Fitted
 from .grasped_frames import Timed
 from .held_out import from_rest, noise_variance
@@ -41,8 +42,6 @@ DEGREES_RANGE = (4.0, 400.0)
 the same variance for all."""
 MAX_LEARNING_FRAMES = 60
 """Frames, spread evenly, that the variances are learned from; all fitted frames predict."""
-PARTICLES_AT_ONCE = 16
-"""Particles that are predicted together: with 600 frames they take 300 MB."""
 UNSEEN_VARIANCE = 1e6
 """Variance of a residual that was not observed, over the mean square of the residual: it then does not count."""
 
@@ -147,7 +146,7 @@ def remainder(
     terms, known = jnp.asarray(_terms(frames)), np.flatnonzero(fitted)
     learned = known[np.unique(np.linspace(0, len(known) - 1, min(len(known), MAX_LEARNING_FRAMES)).astype(int))]
     parameters = _likeliest(terms[:, learned][:, :, learned], observed.at(learned))
-    mean, variance = _predicted(jnp.asarray(parameters), terms, jnp.asarray(known), observed)
+    mean, variance = predicted_remainder(jnp.asarray(parameters), terms, jnp.asarray(known), observed)
     variances = scale * np.exp(parameters[:-1])
     return FittedRemainder(
         mean=np.sqrt(scale) * np.asarray(mean).swapaxes(0, 1),
@@ -170,7 +169,7 @@ def _terms(frames: list[Timed]) -> Float[np.ndarray, "terms frames frames"]:
 
 def _likeliest(terms: Float[Array, "terms t t"], observed: Observed) -> Float[np.ndarray, " parameters"]:
     """Return the logarithms of the variances, and of the degrees of freedom, of largest posterior."""
-    objective = jax.jit(jax.value_and_grad(_minus_log_posterior))
+    objective = jax.jit(jax.value_and_grad(minus_log_posterior))
     bounds = [LOG_RANGE] * len(TERMS) + [tuple(np.log(DEGREES_RANGE))]
 
     def at(parameters: np.ndarray) -> tuple[float, np.ndarray]:
@@ -182,7 +181,7 @@ def _likeliest(terms: Float[Array, "terms t t"], observed: Observed) -> Float[np
     return np.asarray(min(found, key=lambda one: one.fun).x)
 
 
-def _minus_log_posterior(
+def minus_log_posterior(
     parameters: Float[Array, " parameters"], terms: Float[Array, "terms t t"], observed: Observed
 ) -> Float[Array, ""]:
     """Return the negative logarithm of likelihood and prior [nat], up to a constant."""
@@ -196,11 +195,11 @@ def _minus_log_posterior(
         return normaliser - (degrees + count) / 2 * jnp.log1p(squared / (degrees - 2)) - log_det
 
     prior = 0.5 * jnp.sum((parameters[:-1] / PRIOR_LOG_SD) ** 2)
-    return prior - jnp.sum(jax.vmap(log_likelihood)(observed))
+    return prior - jnp.sum(map_rows(log_likelihood, observed))
 
 
 @jax.jit
-def _predicted(
+def predicted_remainder(
     parameters: Float[Array, " parameters"],
     terms: Float[Array, "terms frames frames"],
     known: Int[Array, " t"],
@@ -219,4 +218,4 @@ def _predicted(
         ratio = (degrees - 2 + jnp.sum(white**2)) / (degrees - 2 + before.count)
         return spread.T @ white, ratio * (own - jnp.sum(spread**2, axis=0) + one.noise)
 
-    return jax.lax.map(of_one, observed, batch_size=PARTICLES_AT_ONCE)
+    return jax.lax.map(of_one, observed)

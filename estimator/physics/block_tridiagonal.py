@@ -10,9 +10,7 @@ Computing 5:45]. The work is the same, but a GPU, which waits for each block, el
 banded right-hand side stays sparse for longer.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,6 +20,8 @@ import scipy.sparse as sp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from ..map_rows import map_rows
 
 ORDER_DIRECTIONS = 36
 """Directions in the sheet's plane along which an order of the particles is tried: one every 5 degrees."""
@@ -158,7 +158,7 @@ def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
     ends, middle = _split(matrix.diagonal)
     half = ends.shape[1]
     couplings = jnp.stack([matrix.lower[:half], matrix.lower[half:][::-1].swapaxes(1, 2)])
-    taken, (inverse, inward) = _from_both_ends(partial(jax.lax.scan, step, jnp.zeros_like(middle)), (ends, couplings))
+    taken, (inverse, inward) = map_rows(partial(jax.lax.scan, step, jnp.zeros_like(middle)), (ends, couplings))
     return BlockCholesky(inverse=inverse, inward=inward, middle=inverse_factor(middle - taken[0] - taken[1]))
 
 
@@ -214,7 +214,7 @@ def lower_square(factor: BlockCholesky, rhs: Float[Array, "blocks m n"]) -> Floa
 
     mirrored = rhs.reshape(nb, m, nb, w)[::-1, :, ::-1].reshape(nb, m, n)
     ends = jnp.stack([rhs[:half, :, :reached], mirrored[:half, :, :reached]])
-    squares, taken = _from_both_ends(outer, (factor.inverse, factor.inward, ends))
+    squares, taken = map_rows(outer, (factor.inverse, factor.inward, ends))
     right = rhs[half].at[:, :reached].add(-taken[0])
     right = right.at[:, n - reached :].add(-taken[1].reshape(m, half + 1, w)[:, ::-1].reshape(m, reached))
     z = factor.middle @ right
@@ -239,7 +239,7 @@ def inverse_band(factor: BlockCholesky) -> BlockTridiagonal:
         return diagonal, (diagonal, off_diagonal)
 
     outwards = partial(jax.lax.scan, step, middle, reverse=True)
-    _, (ends, off_diagonal) = _from_both_ends(outwards, (factor.inverse, factor.inward))
+    _, (ends, off_diagonal) = map_rows(outwards, (factor.inverse, factor.inward))
     lower = jnp.concatenate([off_diagonal[0], off_diagonal[1, ::-1].swapaxes(1, 2)])
     return BlockTridiagonal(diagonal=_joined(ends, middle), lower=lower)
 
@@ -278,15 +278,10 @@ def solve(layout: Layout, factor: BlockCholesky, rhs: Float[Array, "n 3"]) -> Fl
 
     ends, middle = _split(layout.blocks(rhs).reshape(layout.n_blocks, -1))
     start = partial(jax.lax.scan, forward, jnp.zeros_like(middle))
-    taken, z = _from_both_ends(start, (factor.inverse, factor.inward, ends))
+    taken, z = map_rows(start, (factor.inverse, factor.inward, ends))
     middle = factor.middle.T @ (factor.middle @ (middle - taken[0] - taken[1]))
-    _, x = _from_both_ends(partial(jax.lax.scan, backward, middle, reverse=True), (factor.inverse, factor.inward, z))
+    _, x = map_rows(partial(jax.lax.scan, backward, middle, reverse=True), (factor.inverse, factor.inward, z))
     return layout.rows(_joined(x, middle).reshape(layout.n_blocks, layout.width, 3))
-
-
-def _from_both_ends(run: Callable[[Any], Any], blocks: Any) -> Any:
-    """Apply `run` to the blocks of either end, the first axis: in turn on a CPU, whose cores share each product."""
-    return jax.lax.platform_dependent(blocks, cpu=partial(jax.lax.map, run), default=jax.vmap(run))
 
 
 def _split(blocks: Float[Array, "blocks ..."]) -> tuple[Float[Array, "2 half ..."], Float[Array, "..."]]:

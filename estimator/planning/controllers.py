@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..filters.shots import slopes
+from ..map_rows import map_rows
 from ..physics.environment import Grip
 from ..physics.simulator import SWEEPS_PER_STEP
 from ..physics.xpbd import XPBD
@@ -181,7 +182,7 @@ def large_step(
         tip, _ = jax.lax.scan(step, tip, length=iterations)
         return tip, loss(tip)
 
-    tips, losses = _map_tips(descend, tips)
+    tips, losses = map_rows(descend, tips)
     losses = jnp.where(jnp.isfinite(losses), losses, jnp.inf)
     order = jnp.argsort(losses)
     return Samples(tips=tips[order], loss=losses[order])
@@ -200,13 +201,6 @@ PRIMITIVES = {
     "right": (1.0, 0.0, 0.0),
 }
 """Directions of the paper's motion primitives; down is forbidden, because the ground is there."""
-
-
-def _map_tips(function: Callable, tips: Float[Array, "k 3"]):
-    """Return a function of every tip: one by one on a CPU, where that is faster, and vectorised on a GPU."""
-    return jax.lax.platform_dependent(
-        tips, cpu=lambda tips: jax.lax.map(function, tips), default=lambda tips: jax.vmap(function)(tips)
-    )
 
 
 def _towards(tip: Float[Array, " 3"], to: Float[Array, " 3"], longest: float | Array) -> Float[Array, " 3"]:

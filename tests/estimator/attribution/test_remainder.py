@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from jiggle_mj.estimator.attribution.grasped_frames import ClosedFrame, Timed
-from jiggle_mj.estimator.attribution.remainder import TERMS, FittedRemainder, remainder
+from jiggle_mj.estimator.attribution.remainder import (
+    TERMS,
+    FittedRemainder,
+    Observed,
+    minus_log_posterior,
+    predicted_remainder,
+    remainder,
+)
+from tests.support.compiled_programs import batched_lapack_calls
 
 FRAMES, PARTICLES, FITTED = 24, 60, 16
 NOISE = 1e-4
@@ -128,3 +136,16 @@ def test_another_grasp_has_no_mean_and_intervals_that_hold():
 def test_without_an_observed_residual_there_is_none():
     with pytest.raises(ValueError, match="observed in a frame that was fitted to"):
         fit_to(drawn(TERMS, seed=0), seen=np.zeros((FRAMES, PARTICLES), bool))
+
+
+def test_lapack_gets_one_matrix_at_a_time():
+    """Batches of matrices may wait for each other forever; see `map_rows`."""
+    terms, known = jnp.ones((len(TERMS), FRAMES, FRAMES)), jnp.arange(FITTED)
+    observed = Observed(
+        residual=jnp.zeros((PARTICLES, FRAMES, 3)),
+        seen=jnp.ones((PARTICLES, FRAMES), bool),
+        noise=jnp.ones((PARTICLES, FRAMES)),
+    )
+    parameters = jnp.zeros(len(TERMS) + 1)
+    assert not batched_lapack_calls(jax.grad(minus_log_posterior), parameters, terms, observed)
+    assert not batched_lapack_calls(predicted_remainder, parameters, terms, known, observed)
