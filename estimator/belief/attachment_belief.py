@@ -221,13 +221,13 @@ class AttachmentBelief(eqx.Module):
         )
         share = belief.prior.share_beside(samples.probability)
         belief = eqx.tree_at(lambda belief: belief.prior.share, belief, share)
-        _, log_bayes_factor = belief._mixture(*belief._cavity(belief.gaussian()))
+        _, log_bayes_factor = belief._mixture(*belief.cavity_of(belief.gaussian()))
         message = messages_with_probability(self.prior, samples.probability[0], log_bayes_factor)
         return eqx.tree_at(lambda belief: belief.message, belief, message)
 
     def sweep(self, gaussian: Gaussian) -> "AttachmentBelief":
         """Run one damped sweep of expectation and belief propagation over all particles, given `gaussian()`."""
-        return self._match_moments(*self._cavity(gaussian))
+        return self._match_moments(*self.cavity_of(gaussian))
 
     def swept(self, sweeps: int) -> "AttachmentBelief":
         """Run several sweeps."""
@@ -242,7 +242,7 @@ class AttachmentBelief(eqx.Module):
     def posterior(self) -> Posterior:
         """Return the marginal posterior of each particle; call `sweep` before."""
         gaussian = self.gaussian()
-        mixture, _ = self._mixture(*self._cavity(gaussian))
+        mixture, _ = self._mixture(*self.cavity_of(gaussian))
         mean = jnp.clip(gaussian.mean, 0, MAX_MEAN)
         sd = jnp.sqrt(gaussian.variance + self._mesh_variance(gaussian.mean))
         return Posterior(
@@ -278,7 +278,7 @@ class AttachmentBelief(eqx.Module):
         `BeliefConfig.open_above`.
         """
         tail, gaussian = self.config.tail, self.gaussian()
-        mixture, _ = self._mixture(*self._cavity(gaussian))
+        mixture, _ = self._mixture(*self.cavity_of(gaussian))
         added = self._mesh_variance(gaussian.mean)
         mixture = eqx.tree_at(lambda parts: parts.sd, mixture, jnp.sqrt(mixture.sd**2 + added[None]))
         may_be_free = 1 - mixture.attached > tail
@@ -288,7 +288,7 @@ class AttachmentBelief(eqx.Module):
 
     def mixture(self) -> Mixture:
         """Return the posterior of each particle's s as a mixture of truncated normals."""
-        return self._mixture(*self._cavity(self.gaussian()))[0]
+        return self._mixture(*self.cavity_of(self.gaussian()))[0]
 
     @property
     def _log_odds(self) -> Float[Array, " n"]:
@@ -322,7 +322,7 @@ class AttachmentBelief(eqx.Module):
         variance = (part * (own - other)) ** 2
         return jnp.where(self.prior.neighbours < len(self.shift), variance, 0.0)
 
-    def _cavity(self, gaussian: Gaussian) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    def cavity_of(self, gaussian: Gaussian) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """Return mean and variance of each particle's s without its own site."""
         return cavity(gaussian, self.site_precision, self.site_shift)
 

@@ -170,17 +170,25 @@ class SpikeAndSlab(eqx.Module):
             log_odds: log odds of attached before it.
             share: probability of each component of each particle if it is attached, before it; None for `share`.
         """
-        centre, width = self.mean[:, None], self.sd[:, None] ** 2
-        mean, variance = mean[None], variance[None]
-        combined = 1 / (1 / variance + 1 / width)
-        parts = Mixture(weight=combined, mean=combined * (mean / variance + centre / width), sd=jnp.sqrt(combined))
-        log_likelihood = norm.logpdf(mean, centre, jnp.sqrt(variance + width))
-        evidence = log_likelihood + _log_mass_inside(parts.mean, parts.sd) - _log_mass_inside(centre, self.sd[:, None])
+        combined, evidence = self._combined(mean, variance)
         components = evidence[1:] + jnp.log(self.share[:, None] if share is None else share)
         log_bayes_factor = logsumexp(components, axis=0) - evidence[0]
         attached = jax.nn.sigmoid(log_odds + log_bayes_factor)[None]
         weight = jnp.concatenate([1 - attached, attached * jax.nn.softmax(components, axis=0)])
-        return eqx.tree_at(lambda parts: parts.weight, parts, weight), log_bayes_factor
+        return eqx.tree_at(lambda parts: parts.weight, combined, weight), log_bayes_factor
+
+    def log_density_if_free(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the log density of a measurement of each s if the particle is free, arguments as in `posterior`."""
+        return self._combined(mean, variance)[1][0]
+
+    def _combined(self, mean: Float[Array, " n"], variance: Float[Array, " n"]) -> tuple[Mixture, Float[Array, "c n"]]:
+        """Return each component times the measurement, with any weights, and the measurement's log density by each."""
+        centre, width = self.mean[:, None], self.sd[:, None] ** 2
+        mean, variance = mean[None], variance[None]
+        combined = 1 / (1 / variance + 1 / width)
+        parts = Mixture(weight=combined, mean=combined * (mean / variance + centre / width), sd=jnp.sqrt(combined))
+        inside = _log_mass_inside(parts.mean, parts.sd) - _log_mass_inside(centre, self.sd[:, None])
+        return parts, norm.logpdf(mean, centre, jnp.sqrt(variance + width)) + inside
 
 
 def _nearest_component(components: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r r"]:
