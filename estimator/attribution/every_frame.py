@@ -8,8 +8,9 @@ from jaxtyping import Array, Float
 
 from ..effects.sheet_model import FrameContext
 from ..parallel_map import T, parallel_map
+from .frame_likelihood import N_FIELDS, FrameLikelihood, frame_likelihood
 from .grasped_frames import ClosedFrame
-from .linear import N_FIELDS, Metric, NormalEquations, WeightedResiduals, misfit, normal_equations, weigh
+from .linear import NormalEquations, WeightedResiduals, misfit, normal_equations
 from .normal_equations import less_offset
 from .problem import Point, Problem
 
@@ -24,18 +25,18 @@ def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
     return along
 
 
-def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Metric]:
+def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, FrameLikelihood]:
     """Return the weights of residuals of each frame at a point."""
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
 
-    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> Metric:
-        return weigh(problem.sheet, theta, s, frame, context, x, noise)
+    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameLikelihood:
+        return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise)
 
     return _each(problem, point, frames, one)
 
 
 def linearised(
-    problem: Problem, point: Point, weights: dict[int, Metric], along: Float[np.ndarray, "p d"]
+    problem: Problem, point: Point, weights: dict[int, FrameLikelihood], along: Float[np.ndarray, "p d"]
 ) -> dict[int, NormalEquations]:
     """Return the normal equations of each frame, linearised where its weights were computed."""
     theta, along_ = jnp.asarray(point.theta), jnp.asarray(along)
@@ -46,12 +47,12 @@ def linearised(
     return _each(problem, point, weights, one)
 
 
-def cost_under(problem: Problem, weights: dict[int, Metric], point: Point) -> float:
+def cost_under(problem: Problem, weights: dict[int, FrameLikelihood], point: Point) -> float:
     """Return twice the negative log likelihood of a point's predictions [nat], under weights of another point."""
     return cost(problem, weights, residual(problem, weights, point), problem.amplitude)
 
 
-def residual(problem: Problem, weights: dict[int, Metric], point: Point) -> dict[int, WeightedResiduals]:
+def residual(problem: Problem, weights: dict[int, FrameLikelihood], point: Point) -> dict[int, WeightedResiduals]:
     """Return the weighted residuals of a point's predictions in each frame, under weights of another point."""
     theta = jnp.asarray(point.theta)
 
@@ -61,7 +62,9 @@ def residual(problem: Problem, weights: dict[int, Metric], point: Point) -> dict
     return _each(problem, point, weights, one)
 
 
-def cost(problem: Problem, weights: dict[int, Metric], every: dict[int, WeightedResiduals], amplitude: float) -> float:
+def cost(
+    problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals], amplitude: float
+) -> float:
     """Return twice the negative log likelihood of residuals [nat], for an amplitude of the smooth force fields."""
     total = 0.0
     for frames in problem.by_part(weights).values():

@@ -17,7 +17,8 @@ from ..belief.gaussian_information import GaussianInformation
 from ..filters.implicit import likeliest, quick_summary
 from ..filters.posterior_summary import PosteriorSummary
 from .every_frame import cost_under, directions, linearised, weighed
-from .linear import Metric, NormalEquations
+from .frame_likelihood import FrameLikelihood
+from .linear import NormalEquations
 from .normal_equations import reduced
 from .problem import Point, Problem
 from .sheet import predict_all
@@ -62,7 +63,7 @@ class Fitted:
     """Normal equations over s, the free parameters and -1."""
     equations: dict[int, NormalEquations]
     """Normal equations of each frame."""
-    weights: dict[int, Metric]
+    weights: dict[int, FrameLikelihood]
     """Weights of the residuals of each frame."""
     summary: PosteriorSummary
     """Posterior of the attachments, with the free parameters marginalised."""
@@ -180,7 +181,11 @@ def linearise_at(problem: Problem, named: np.ndarray, point: Point, frames: list
 
 
 def _fit_at(
-    problem: Problem, named: np.ndarray, point: Point, equations: dict[int, NormalEquations], weights: dict[int, Metric]
+    problem: Problem,
+    named: np.ndarray,
+    point: Point,
+    equations: dict[int, NormalEquations],
+    weights: dict[int, FrameLikelihood],
 ) -> Fitted:
     free, sd = problem.free(named), problem.sd(named)
     square = reduced(problem, equations, len(free))
@@ -314,7 +319,7 @@ def _joint(square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -
     return joint.with_independent("theta", sd**-2, -point.theta[free] / sd**2)
 
 
-def _cost(problem: Problem, weights: dict[int, Metric], point: Point, named: np.ndarray) -> float:
+def _cost(problem: Problem, weights: dict[int, FrameLikelihood], point: Point, named: np.ndarray) -> float:
     """Return the cost of a point under weights that may be of another point; see `Fitted.cost`."""
     prior = _prior(point.theta, point.s, problem.free(named), problem.sd(named))
     return cost_under(problem, weights, point) + prior

@@ -13,8 +13,8 @@ from ..belief.gaussian_information import GaussianInformation
 from ..parallel_map import parallel_map
 from .every_frame import weighed
 from .fit import Fitted
+from .frame_likelihood import FrameLikelihood
 from .grasped_frames import ClosedFrame
-from .linear import Metric
 from .problem import Point, Problem
 from .sheet import predict_all
 
@@ -163,12 +163,16 @@ def _covariance(problem: Problem, fitted: Fitted) -> Float[np.ndarray, "n n"]:
 
 
 def _variances(
-    problem: Problem, metric: Metric, seen: ClosedFrame, known: Float[np.ndarray, "n n"], x: Float[Array, "n 3"]
+    problem: Problem,
+    likelihood: FrameLikelihood,
+    seen: ClosedFrame,
+    known: Float[np.ndarray, "n n"],
+    x: Float[Array, "n 3"],
 ) -> Variances:
     """Return the variances of each observed coordinate; `known` is the covariance of s."""
-    n, frame, held = len(x), metric.frame, np.asarray(seen.held)
+    n, frame, held = len(x), likelihood.frame, np.asarray(seen.held)
     rows = np.zeros((n + 1, 3, n + 1, 3))
-    neighbours = np.asarray(metric.balance.neighbours)
+    neighbours = np.asarray(likelihood.balance.neighbours)
     rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(np.asarray(frame.dr_dx), 2, 3).swapaxes(2, 3)
     H = rows[:n, :, :n].reshape(3 * n, 3 * n)
     H[np.repeat(held, 3)] = 0.0

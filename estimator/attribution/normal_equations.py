@@ -4,8 +4,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..belief.gaussian_information import GaussianInformation
+from .frame_likelihood import N_FIELDS
 from .grasped_frames import ClosedFrame
-from .linear import N_FIELDS, NormalEquations, grasp_sd, tool_sd
+from .linear import NormalEquations, grasp_sd, tool_sd
 from .problem import Problem
 
 FIELDS = slice(-1 - N_FIELDS, -1)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .every_frame import cost, residual, weighed
 from .fit import Fitted
-from .linear import N_FIELDS, Metric
+from .frame_likelihood import N_FIELDS, FrameLikelihood
 from .normal_equations import less_offset
 from .problem import Problem
 
@@ -79,6 +79,6 @@ def tool_variance(problem: Problem, fitted: Fitted) -> tuple[float, float]:
 
 
 @eqx.filter_jit
-def _log_determinant(metric: Metric):
+def _log_determinant(likelihood: FrameLikelihood):
     """Return the log determinant as a compiled program."""
-    return metric.log_determinant()
+    return likelihood.log_determinant()

@@ -162,6 +162,12 @@ def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
     return BlockCholesky(inverse=inverse, inward=inward, middle=inverse_factor(middle - taken[0] - taken[1]))
 
 
+def log_det(factor: BlockCholesky) -> Float[Array, ""]:
+    """Return ln |A| of the factorised matrix; NaN where it is not positive definite."""
+    diagonals = [jnp.diagonal(part, axis1=-2, axis2=-1) for part in (factor.inverse, factor.middle)]
+    return -2 * (jnp.sum(jnp.log(diagonals[0])) + jnp.sum(jnp.log(diagonals[1])))
+
+
 def lower_inverse(factor: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Return the inverse of a lower triangular matrix: by halves on a CPU, whose products are faster than its solves.
 

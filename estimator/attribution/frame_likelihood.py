@@ -1,0 +1,172 @@
+"""Likelihood of one frame's observed positions, linearised at its predicted state.
+
+Let e = H (y - h(x)), with x the predicted equilibrium. Let N be the covariance of the model's force errors and of the
+noise of observed positions, mapped to forces by H. Then
+
+    e + H F a + Q c = n,    n ~ N(0, N),  a ~ N(0, I),  c ~ N(0, amplitude^2 I)
+
+with F the smooth fields of the noise, independent in every frame, and Q smooth force fields that stand for any other
+error of the model and are the same in all frames of a grasp. So the log density of the positions is, for c = 0,
+
+    -1/2 [e^T (N + H F F^T H^T)^-1 e + ln |N + H F F^T H^T| - 2 ln |H|]
+
+up to a constant. A model that yields more has a wider density, so a comparison of models needs both determinants. c is
+eliminated grasp by grasp (`every_frame.cost`).
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..effects.mechanical import cosines, flat
+from ..effects.sheet_model import FrameContext
+from ..filters.evidence import Evidence
+from ..filters.force_balance import ForceBalance
+from ..filters.frame import Frame
+from ..filters.smooth_noise import each
+from ..physics.block_tridiagonal import add_to_diagonal, assemble, cholesky, log_det
+from ..physics.membrane import TriangleMembrane
+from .grasped_frames import ClosedFrame
+from .sheet import PredictedSheet, mean_of_held
+
+WAVES = 4
+"""Cosines along each side of the sheet in the smooth force fields."""
+N_FIELDS = 3 * WAVES**2
+"""Number of smooth force fields: each product of cosines in three directions."""
+HELD_STATE_PRECISION = 1e12
+"""Precision of the state of what is held, which follows the grip exactly [1/m^2]."""
+
+
+class FrameLikelihood(eqx.Module):
+    """Likelihood of a frame's observed positions near its predicted state."""
+
+    balance: ForceBalance
+    """Force balance of the frame."""
+    frame: Frame
+    """The force balance linearised at the predicted state."""
+    seen: Float[Array, " n"]
+    """1 for particles whose position is used, 0 for the others."""
+    noise: Float[Array, "n 3 c"]
+    """Smooth noise, whitened: N^-1 H F."""
+    spread: Float[Array, "c c"]
+    """Lower Cholesky factor of I + F^T H^T N^-1 H F."""
+    fields: Float[Array, "n 3 q"]
+    """Smooth force fields Q."""
+    white: Float[Array, "n 3 q"]
+    """Smooth force fields, whitened: N^-1 Q."""
+    among: Float[Array, "q q"]
+    """Inner products of the fields: Q^T (N + H F F^T H^T)^-1 Q."""
+
+    def dot(
+        self, left: Float[Array, "n 3 l"], right: Float[Array, "n 3 r"], white: Float[Array, "n 3 r"]
+    ) -> Float[Array, "l r"]:
+        """Return left^T (N + H F F^T H^T)^-1 right, given `white` = N^-1 right."""
+        a, b = (jnp.einsum("nic,nik->ck", self.noise, side) for side in (left, right))
+        solved = jax.scipy.linalg.cho_solve((self.spread, True), b)
+        return jnp.einsum("nil,nir->lr", left, white) - a.T @ solved
+
+    def whitened(self, columns: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
+        """Return N^-1 times each column."""
+        return each(partial(self.balance.whitened, self.frame), columns)
+
+    def forces(self, residual: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """Return the forces H (y - h(x)) of a residual of positions y - h(x) [m]."""
+        return self.balance.apply(self.frame.dr_dx, self.seen[:, None] * residual)
+
+    def log_determinant(self) -> Float[Array, ""]:
+        """Return ln |C| of the observed positions' covariance C, up to the precision of their white noise.
+
+        It is ln |N + H F F^T H^T| - 2 ln |H|. Rows without a force equation are those of inputs, and do not count.
+        """
+        w, known = self.frame.weight, self.frame.weight > 0
+        log_weights = jnp.sum(jnp.where(known, 3 * jnp.log(jnp.where(known, w, 1.0)), 0.0))
+        smooth = 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
+        return log_det(self.frame.factor) - log_weights + smooth - self._log_det_of_square()
+
+    def _log_det_of_square(self) -> Float[Array, ""]:
+        """Return ln |H^T H| over the particles with a force equation."""
+        balance, known = self.balance, self.frame.weight > 0
+        both = known[:, None] & jnp.append(known, False)[balance.neighbours]
+        rows = jnp.where(both[:, :, None, None], self.frame.dr_dx, 0.0)
+        square = assemble(balance.layout, [(balance.places, jnp.einsum("npij,nqik->npjqk", rows, rows))])
+        inputs = jnp.where(known[:, None, None], 0.0, jnp.eye(3)[None])
+        return log_det(cholesky(add_to_diagonal(balance.layout, square, inputs)))
+
+
+def frame_likelihood(
+    sheet: PredictedSheet,
+    theta: Float[Array, " p"],
+    s: Float[Array, " n"],
+    frame: ClosedFrame,
+    context: FrameContext,
+    x: Float[Array, "n 3"],
+    noise: Float[Array, "n modes"],
+) -> FrameLikelihood:
+    """Return a frame's likelihood at its predicted state x; `noise` are the smooth noise's fields [m].
+
+    It is two programs, like `normal_equations`: as one, XLA lays the factor out so that a solve takes 1.5 times as
+    long.
+    """
+    return _likelihood(*_around(sheet, theta, s, frame, context, x), frame, noise)
+
+
+@eqx.filter_jit
+def _around(
+    sheet: PredictedSheet,
+    theta: Float[Array, " p"],
+    s: Float[Array, " n"],
+    frame: ClosedFrame,
+    context: FrameContext,
+    x: Float[Array, "n 3"],
+) -> tuple[ForceBalance, Frame, Float[Array, "n 3 q"]]:
+    """Return the force balance, its linearisation at x, and Q."""
+    model = sheet.model(theta, context, frame.displacement)
+    balance = sheet.balance_of(model.energy)
+    precision = jnp.where(frame.held[:, None, None], HELD_STATE_PRECISION * jnp.eye(3)[None], frame.precision)
+    linear = balance.linearise(
+        x, s, Evidence(y=x, precision=precision, held=frame.held, force_unknown=frame.force_unknown)
+    )
+    return balance, linear, _fields(model.term(TriangleMembrane), sheet.balance.energy.rest, linear.error)
+
+
+@eqx.filter_jit
+def _likelihood(
+    balance: ForceBalance,
+    linear: Frame,
+    fields: Float[Array, "n 3 q"],
+    frame: ClosedFrame,
+    noise: Float[Array, "n modes"],
+) -> FrameLikelihood:
+    smooth = noise[:, None, :, None] * jnp.eye(3)[None, :, None, :]
+    smooth = each(partial(balance.apply, linear.dr_dx), seen_shift(frame, smooth.reshape(len(noise), 3, -1)))
+    white = each(partial(balance.whitened, linear), smooth)
+    likelihood = FrameLikelihood(
+        balance=balance,
+        frame=linear,
+        seen=frame.counted.astype(float),
+        noise=white,
+        spread=jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white)),
+        fields=fields,
+        white=each(partial(balance.whitened, linear), fields),
+        among=jnp.zeros((N_FIELDS, N_FIELDS)),
+    )
+    return eqx.tree_at(lambda one: one.among, likelihood, likelihood.dot(fields, fields, likelihood.white))
+
+
+def seen_shift(frame: ClosedFrame, shift: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
+    """Return the observed shift of positions: of each counted particle itself, and the mean of those that are held."""
+    counted = frame.counted
+    held = jnp.where(frame.held[:, None, None], mean_of_held(frame, shift)[None], 0.0)
+    return jnp.where(counted[:, None, None], shift, held)
+
+
+def _fields(
+    membrane: TriangleMembrane, rest: Float[Array, "n 3"], error: Float[Array, " n"]
+) -> Float[Array, "n 3 fields"]:
+    """Return the smooth force fields Q: cosines over the sheet in each direction, scaled by the force error."""
+    waves = cosines(flat(membrane, rest, rest), WAVES)
+    along = error[:, None, None, None] * waves[:, None, :, None] * jnp.eye(3)[None, :, None, :]
+    return along.reshape(len(rest), 3, N_FIELDS)
