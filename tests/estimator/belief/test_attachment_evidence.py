@@ -69,7 +69,7 @@ def test_independent_measurements_on_a_tree_are_exact(coupling: float):
 
 @pytest.mark.parametrize(("share", "error"), [(0.0, 5e-3), (0.3, 0.02), (0.6, 0.1)])
 def test_two_particles_whose_evidence_is_correlated(share: float, error: float):
-    """The more one load can be borne by either, the less a Gaussian site stands for both peaks."""
+    """The more either may bear the load alone, the less a Gaussian site stands for both peaks."""
     sd, mean = np.array([0.02, 0.03]), np.array([0.1, 0.15])
     precision = np.linalg.inv(np.outer(sd, sd) * np.array([[1, -share], [-share, 1]]))
     shift = precision @ mean
