@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..perception.cloud_surface import Cloud
+from ..physics.energy import SheetEnergy
 
 MIN_DIRECTION = 1e-6
 """Smallest precision that counts as an observation of a direction [largest precision of the particle]."""
@@ -59,6 +60,8 @@ class Evidence(eqx.Module):
     what is known without it. None where the particles are identified."""
     force: MeasuredPull | None = None
     """The tool's force; None where it was not measured, and for the prediction of a pull."""
+    energy: SheetEnergy | None = None
+    """Energy of the sheet in this frame, as declared effects change it; None for the same in all frames."""
 
     def near(self, x: Float[Array, "n 3"], *, gate: float = 0.0) -> "Evidence":
         """Return the evidence with a cloud matched to the surface at a state; see `Cloud.matched` for the gate."""

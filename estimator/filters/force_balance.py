@@ -17,6 +17,7 @@ needed. R and A are without the noise that neighbours share (`smooth_noise`). A 
 (`Evidence.near`).
 """
 
+from dataclasses import replace
 from functools import partial
 
 import equinox as eqx
@@ -141,7 +142,12 @@ class ForceBalance(eqx.Module):
 
     def with_energy(self, energy: SheetEnergy) -> "ForceBalance":
         """Return the balance of the same mesh with another energy, such as one of other parameters."""
-        return eqx.tree_at(lambda balance: (balance.energy, balance.tethered), self, (energy, Tethered.build(energy)))
+        return eqx.tree_at(lambda b: (b.energy, b.tethered), self, (energy, self.tethered.with_energy(energy)))
+
+    def in_frame(self, evidence: Evidence) -> tuple["ForceBalance", Evidence]:
+        """Return the balance with the energy of one frame, and the frame's evidence without it."""
+        own = self if evidence.energy is None else self.with_energy(evidence.energy)
+        return own, replace(evidence, energy=None)
 
     def error(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return tau, the standard deviation of the model's force error on each particle [N].

@@ -73,10 +73,10 @@ class GraspFrames(eqx.Module):
         grasp, balance = GraspFrames.empty(len(s), noise), balance.inflated(noise.force)
 
         def relinearise(k: int) -> tuple[Float[Array, "n 3"], FrameInformation, ForceResiduals, FrameForce | None]:
-            evidence = self.frames[k].evidence.inflated(noise.position)
-            frame, fit, information = balance.evidence_near(self.frames[k].x, s, evidence)
-            force = None if evidence.force is None else frame_force(balance, frame, fit)
-            return frame.x, information, _residuals(balance, frame, fit), force
+            own_balance, evidence = balance.in_frame(self.frames[k].evidence.inflated(noise.position))
+            frame, fit, information = own_balance.evidence_near(self.frames[k].x, s, evidence)
+            force = None if evidence.force is None else frame_force(own_balance, frame, fit)
+            return frame.x, information, _residuals(own_balance, frame, fit), force
 
         for k, (x, information, residuals, force) in parallel_map(relinearise, range(len(self.frames))).items():
             grasp = grasp.with_frame(self.frames[k].evidence, x, information, residuals, force)

@@ -351,7 +351,7 @@ def _updated(
 
     `balance` and `evidence` have the assumed noise; `noise` has the factors on the variances of forces and positions.
     """
-    s, balance, evidence = belief.bounded(b), balance.inflated(noise[0]), evidence.inflated(noise[1])
+    s, (balance, evidence) = belief.bounded(b), balance.inflated(noise[0]).in_frame(evidence.inflated(noise[1]))
     frame, _, information = balance.evidence_near(balance.settle(start, s, evidence), s, evidence)
     belief, gaussian = belief.updated(information.precision, information.shift)
     nis = _normalised_innovation(information, gaussian, frame.evidence)

@@ -31,6 +31,11 @@ class Tethered(eqx.Module):
         rest = np.asarray(energy.rest)
         return cls(energy=SheetEnergy.build(rest, (*energy.terms, Tether.build(rest)), energy.layout))
 
+    def with_energy(self, energy: SheetEnergy) -> "Tethered":
+        """Return the same springs on a sheet of another energy with the same terms."""
+        changed = energy.rest, (*energy.terms, self.energy.terms[-1])
+        return eqx.tree_at(lambda tethered: (tethered.energy.rest, tethered.energy.terms), self, changed)
+
     def settle(
         self,
         b: Float[Array, " n"],
