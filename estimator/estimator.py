@@ -25,11 +25,12 @@ from .belief.attachment_belief import AttachmentBelief
 from .belief.topology import Change, region_of
 from .blas import one_thread
 from .config import EstimatorConfig
+from .corrected_frames import refuse_effects_not_carried
 from .filters.force_balance import ForceBalance
 from .filters.kept_frames import kept_frames
 from .filters.posterior_summary import Convergence
 from .force_sensor import ForceSensor
-from .fusion import fill_unseen, fuse, pull
+from .fusion import pull
 from .grip import GripHold, GripTracker
 from .identifying import OnPass, identify_tracked
 from .perception import Disparity, FrameMask, Perception, SimulatorInput, TissueMask, Track
@@ -67,6 +68,7 @@ class Estimator:
         """
         self.declaration = as_instance(declaration, "declaration", Declaration, hint="Declaration() has defaults.")
         self.config = config = as_instance(EstimatorConfig() if config is None else config, "config", EstimatorConfig)
+        refuse_effects_not_carried(declaration, config)
         self.skipped: list[tuple[int, str]] = []
         """Index and reason of each observation that could not be used."""
         self.cloud_shares: list[float] = []
@@ -78,7 +80,9 @@ class Estimator:
         self._open_frame: Observation | None = None
         self._tool: ToolState | None = None
         self._seen_precision = np.eye(3) * INITIAL_POINT_SD**-2
-        self._grip, self._force, self._slip, self._has_estimate = GripTracker(), ForceSensor(), 0.0, False
+        self._force, self._slip, self._has_estimate = ForceSensor(), 0.0, False
+        self.grip, self._hold = GripTracker(), None
+        """The grasp at hand, as it is observed and reported."""
 
     def update(self, observation: Observation) -> Estimate | None:
         """Take one observation; return None if it only helps to fix the rest shape, or cannot be used.
@@ -115,28 +119,27 @@ class Estimator:
             self._change(event, observation.index)
         if not tool.closed:
             self._release()
-            self._grip.release()
+            self.grip.release()
             self._open_frame = observation
             return None
-        if self._grip.begins(tool):
+        if self.grip.begins(tool):
             self._release()
-            self._grip.closing = tool
+            self.grip.closing = tool
         tracked, began = self._tracked, time.perf_counter()
         track = self._see(observation)
         seen = time.perf_counter()
         if track.cloud is None and not track.visible.any():
             self.skipped.append((observation.index, "no particle was seen"))
             return None
-        hold, before = self._grasp(track, tool)
-        frame = fuse(track, hold, tool, before, grip_sd=self.config.grip_sd, field=tracked.field, force=force)
-        state, update = tracked.filter.update(tracked.state, frame.evidence, jnp.asarray(frame.start))
+        hold, before = self._grasp(track, tool, observation.time)
+        frame, state, update = tracked.update(observation, track, hold, before, force=force)
         if not update.explains_the_frame:
             raise PerceptionError(f"observation {observation.index} leaves no finite state: no sheet explains it.")
         if track.cloud is not None:
             track, share = matched(track.cloud, np.asarray(update.x), hold.held)
             self.cloud_shares.append(share)
         tracked.state, tracked.x = state, np.asarray(update.x)
-        self._grip.hold, self._slip = hold, frame.slip
+        self.grip.hold, self._hold, self._slip = hold, frame.hold, frame.slip
         self._seen_precision = track.white_precision[track.visible].mean(axis=0)
         if self.config.refinement == "frames":
             tracked.state = tracked.filter.resample(tracked.state)
@@ -162,8 +165,7 @@ class Estimator:
             if not self._perception.ready:
                 raise PerceptionError("no frame has shown the sheet yet; wait for one before planning a grasp.")
             with jax.enable_x64(True), one_thread():
-                sheet, identified = self._perception.sheet(), self._perception.identifies
-                self._tracked_or_none = TrackedSheet.build(sheet, self.declaration, self.config, identified=identified)
+                self._tracked_or_none = TrackedSheet.seen_by(self._perception, self.declaration, self.config)
         return self.sheet
 
     def release(self) -> None:
@@ -186,7 +188,7 @@ class Estimator:
 
         Raises:
             ValueError: asked before `begin` and the first frame with closed jaws, or of another filter than 'implicit'.
-            OptionError: the sheet has no such parameter.
+            OptionError: the sheet has no such parameter; or effects are declared.
         """
         self._tracked.filter.by_forces("can identify the sheet")
         check_ratios(parameters)
@@ -229,8 +231,7 @@ class Estimator:
     @property
     def force_check(self) -> ForceCheck | None:
         """Measured and predicted force on the tool, as of the last release; None without a measured force."""
-        tracked = self._tracked
-        return summaries.force_check(tracked.filter.force(tracked.state), tracked.stiffness_scale)
+        return summaries.force_check(self._tracked.filter.force(self._tracked.state), self._tracked.stiffness_scale)
 
     @property
     def prior_entropy(self) -> float:
@@ -250,11 +251,10 @@ class Estimator:
         Raises:
             ValueError: asked before `begin`, or of another filter than 'implicit'; this is no change.
         """
-        tracked = self._tracked
         as_instance(change, "change", Change, hint="Estimator.changes lists them.")
-        filter = tracked.filter.by_forces("can infer whether a cut or suture worked")
+        filter = self._tracked.filter.by_forces("can infer whether a cut or suture worked")
         with jax.enable_x64(True), one_thread():
-            return filter.log_bayes_factor(tracked.state, change)
+            return filter.log_bayes_factor(self._tracked.state, change)
 
     @property
     def balance(self) -> ForceBalance:
@@ -312,7 +312,7 @@ class Estimator:
     def positions(self) -> Float[np.ndarray, "n 3"]:
         """Positions of the particles [m]: as estimated while the jaws hold some, else as last seen, or at rest."""
         tracked = self._tracked
-        if self._grip.hold is not None:
+        if self.grip.hold is not None:
             return tracked.x
         if self._open_frame is not None:
             with jax.enable_x64(True), one_thread():
@@ -326,8 +326,8 @@ class Estimator:
 
     @property
     def hold(self) -> GripHold | None:
-        """What the jaws hold; None while they are open."""
-        return self._grip.hold
+        """What the jaws hold, where it is without the errors of declared effects; None while they are open."""
+        return None if self.grip.hold is None else self._hold
 
     @property
     def track_ids(self) -> Int[np.ndarray, " n"] | None:
@@ -337,7 +337,7 @@ class Estimator:
     @property
     def slip(self) -> float:
         """Median distance of the held particles from where the tool should have taken them, as last seen [m]."""
-        return 0.0 if self._grip.hold is None else self._slip
+        return 0.0 if self.grip.hold is None else self._slip
 
     @property
     def tool(self) -> ToolState | None:
@@ -385,10 +385,10 @@ class Estimator:
         moved = pull(before, tool, hold)
         return before, np.asarray(tracked.state.summary.b), Grip.of(moved.tip, moved.length, stiffness)
 
-    def _grasp(self, track: Track, tool: ToolState) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
+    def _grasp(self, track: Track, tool: ToolState, time: int = 0) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
         """Return the grasp of a frame, and the state to start from; see `GripTracker.grasp`."""
         named = self._perception.named_held(tool)
-        return self._grip.grasp(tool, state=self._tracked.x, rest=self.sheet.rest, track=track, named=named)
+        return self._tracked.grasp(self.grip, tool, track, time=time, named=named)
 
     def _positions_with_open_jaws(self, observation: Observation) -> Float[np.ndarray, "n 3"]:
         """Return where the sheet lies [m]: at rest where nothing identifies its particles."""
@@ -397,4 +397,4 @@ class Estimator:
             track = self._see(observation) if self._perception.identifies else None
         except PerceptionError:
             return rest
-        return rest if track is None else fill_unseen(track, rest, self._tracked.field)
+        return rest if track is None else self._tracked.without_grip(track, observation.time)

@@ -26,16 +26,19 @@ TOLERANCE = 1 / 4
 """Residual force at which the unscented filter's equilibria are found [standard deviation of the force error]."""
 
 
-def build_filter(mesh: SheetMesh, declaration: Declaration, config: EstimatorConfig) -> Filter[Any]:
+def build_filter(
+    mesh: SheetMesh, declaration: Declaration, config: EstimatorConfig, *, energy: SheetEnergy | None = None
+) -> Filter[Any]:
     """Return the filter that `config.filter` names, with its prior.
 
     Args:
         mesh: the sheet.
         declaration: stiffnesses in the settings are shares of its membrane stiffness k.
         config: the settings.
+        energy: of the sheet, where it is not what is declared without effects.
     """
     k = declaration.membrane_stiffness
-    energy = surrogate(mesh, declaration, membrane=config.membrane)
+    energy = surrogate(mesh, declaration, membrane=config.membrane) if energy is None else energy
     if config.filter == "implicit":
         balance = force_balance(mesh, energy, declaration, config)
         prior = prior_belief(mesh, reference=float(balance.reference), config=config.prior, belief=config.belief)

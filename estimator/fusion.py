@@ -26,6 +26,8 @@ class FusedFrame:
 
     evidence: Evidence
     """Positions and their precision by perception and grip together."""
+    hold: GripHold
+    """The grasp that it was fused with."""
     start: Float[np.ndarray, "n 3"]
     """Positions from which a search of the state begins, smooth where nothing was seen [m]."""
     slip: float
@@ -80,7 +82,8 @@ def fuse(
         cloud=track.cloud,
         force=force,
     )
-    return FusedFrame(evidence=evidence, start=start, slip=float(np.median(distance)) if len(distance) else 0.0)
+    slip = float(np.median(distance)) if len(distance) else 0.0
+    return FusedFrame(evidence=evidence, hold=hold, start=start, slip=slip)
 
 
 def pull(before: Float[np.ndarray, "n 3"], tool: ToolState, hold: GripHold) -> Pull:

@@ -35,14 +35,21 @@ class GripHold:
 
     @classmethod
     def close(
-        cls, tool: ToolState, positions: Float[np.ndarray, "n 3"], named: Bool[np.ndarray, " n"] | None
+        cls,
+        tool: ToolState,
+        positions: Float[np.ndarray, "n 3"],
+        named: Bool[np.ndarray, " n"] | None,
+        *,
+        corrected: Float[np.ndarray, "n 3"] | None = None,
     ) -> "GripHold":
         """Close the jaws over particles at the given positions [m]; `named` particles replace those in the radius.
+
+        Where positions have known errors, the `corrected` ones say which are in the radius.
 
         Raises:
             PerceptionError: no particle is within reach of the jaws.
         """
-        distance = np.linalg.norm(positions - tool.position, axis=1)
+        distance = np.linalg.norm((positions if corrected is None else corrected) - tool.position, axis=1)
         held = distance <= tool.radius if named is None else named
         if not held.any():
             raise PerceptionError(
@@ -86,6 +93,7 @@ class GripTracker:
         rest: Float[np.ndarray, "n 3"],
         track: Track,
         named: Bool[np.ndarray, " n"] | None,
+        corrected: Float[np.ndarray, "n 3"] | None = None,
     ) -> tuple[GripHold, Float[np.ndarray, "n 3"]]:
         """Return the grasp of a frame, and the state to start from: the last, or rest where the jaws have just closed.
 
@@ -97,6 +105,7 @@ class GripTracker:
             rest: the sheet at rest [m].
             track: what is seen of the particles in this frame.
             named: particles that the recording names as held; None where it names none.
+            corrected: positions as the jaws close, without known errors [m]; None where none are known.
 
         Raises:
             PerceptionError: no particle is within reach of the jaws.
@@ -106,8 +115,10 @@ class GripTracker:
         assert self.closing is not None
         seen = track.visible & (tool is self.closing)
         at_closing = np.where(seen[:, None], np.nan_to_num(track.positions), rest)
+        if corrected is not None:
+            corrected = np.where(seen[:, None], corrected, rest)
         try:
-            return GripHold.close(self.closing, at_closing, named), rest
+            return GripHold.close(self.closing, at_closing, named, corrected=corrected), rest
         except PerceptionError:
             self.closing = None  # a later frame of this grasp may know better
             raise

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jiggle_mj.argument_checks import as_array
+from jiggle_mj.errors import OptionError
 from jiggle_mj.estimate import KeptFrames, Sheet
 from jiggle_mj.material import Material, check_ratios, material
 from jiggle_mj.observation import Declaration
@@ -30,10 +31,13 @@ def identify_tracked(
     The surface that is seen is taken to be within the declared thickness: half of it is one standard deviation.
 
     Raises:
-        OptionError: the sheet has no parameter of a name.
+        OptionError: the sheet has no parameter of a name; or effects are declared, with which each frame has its own
+            energy.
         ValueError: the filter is not 'implicit'.
         PerceptionError: no finite belief explains the frames with the changed sheet.
     """
+    if declaration.effects:
+        raise OptionError(f"the sheet cannot be identified with declared effects ({', '.join(declaration.effects)}).")
     found = identify(
         tracked.filter.by_forces("can identify the sheet"),
         tracked.state,

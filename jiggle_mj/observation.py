@@ -4,7 +4,8 @@ World frame: z up, SI units, times in integer nanoseconds from 0.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -301,6 +302,9 @@ class Declaration:
     """Whether the resting tissue lies on a bed that it cannot penetrate; without gravity there is no bed."""
     mesh: DeclaredMesh | None = None
     """Declared mesh; None to triangulate the first frame."""
+    effects: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """Effects of docs/EFFECTS.md beside all this, by name: the values of their parameters in the effect's units. One
+    that has several sites is named with that of its values: `inclusion.14`. `close-loop` finds them."""
 
     @property
     def hangs(self) -> bool:
@@ -327,6 +331,14 @@ class Declaration:
         store(self, poisson=poisson, gravity=tuple(gravity.tolist()), bed=as_flag(self.bed, "Declaration.bed"))
         if self.mesh is not None:
             as_instance(self.mesh, "Declaration.mesh", DeclaredMesh)
+        store(self, effects=_effects(self.effects))
+
+
+def _effects(values: object) -> dict[str, tuple[float, ...]]:
+    """Return the values of effects by name, as numbers."""
+    where = "Declaration.effects"
+    given = as_instance(values, where, Mapping, hint="Give values by the name of the effect.")
+    return {str(name): tuple(as_array(each, f"{where}: {name}", (None,)).tolist()) for name, each in given.items()}
 
 
 def _track_ids(value: object, where: str, count: int) -> Int[np.ndarray, " m"]:

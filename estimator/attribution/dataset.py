@@ -121,7 +121,7 @@ def stated(points: MeasuredPoints) -> StillNoise:
 
 
 def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, closed: int) -> Timed:
-    hold = estimator.hold
+    hold = estimator.grip.hold
     assert hold is not None
     visible = np.all(np.isfinite(found.observed), axis=1)
     with jax.enable_x64(True):

@@ -124,7 +124,7 @@ def _around(
 ) -> tuple[ForceBalance, Frame, Float[Array, "n 3 q"]]:
     """Return the force balance, its linearisation at x, and Q."""
     model = sheet.model(theta, context, frame.displacement)
-    balance = sheet.balance_of(model.energy)
+    balance = sheet.balance.with_energy(model.energy)
     precision = jnp.where(frame.held[:, None, None], HELD_STATE_PRECISION * jnp.eye(3)[None], frame.precision)
     linear = balance.linearise(
         x, s, Evidence(y=x, precision=precision, held=frame.held, force_unknown=frame.force_unknown)

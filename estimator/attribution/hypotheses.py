@@ -162,7 +162,7 @@ def _fitted(
 def _stepped(problem: Problem, before: Fitted, effect: Effect, at: np.ndarray, score: Score) -> Point:
     """Return the point after a linear step of an effect from a fit without it; that fit's if the step costs more."""
     limit = MAX_START_SDS * problem.prior_sd[at]
-    step = np.clip(before.point.theta[at] + score.theta, 0.0 if effect.non_negative else -limit, limit)
+    step = np.clip(before.point.theta[at] + score.theta, np.maximum(problem.lower_bounds(at), -limit), limit)
     point = moved(problem, before, at, step)
     return before.point if cost_under(problem, before.weights, point) > before.cost else point
 

@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..effects.sheet_model import FrameContext
+from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
 from .frame_likelihood import N_FIELDS, FrameLikelihood, seen_shift
 from .grasped_frames import ClosedFrame
-from .sheet import PredictedSheet, look, tool_residual
+from .sheet import PredictedSheet, tool_residual
 
 TOOL_SD = 2.5e-4
 """Standard deviation of the mean of the held particles about the tool, from frame to frame [m]."""
@@ -103,7 +103,7 @@ def _columns(
     def along(u):
         to = theta + directions @ u
         changed = sheet.model(to, context, frame.displacement)
-        unbalanced = sheet.balance_of(changed.energy).unbalanced(x, s)
+        unbalanced = sheet.balance.with_energy(changed.energy).unbalanced(x, s)
         return unbalanced, look(changed, x), tool_residual(sheet, changed, to, frame, context, x)
 
     dforce, dview, dtool = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))

@@ -9,12 +9,15 @@ from jaxtyping import Float
 
 from ..belief.attachment_belief import AttachmentBelief
 from ..belief.prior import prior_belief
+from ..effects import LIBRARY
+from ..effects.corrected_model import declared_effects
 from ..effects.effect import Effect
+from ..effects.frame_history import FrameHistory
 from ..effects.sheet_model import centred, nominal_energy
 from ..filter_builder import force_balance
 from ..physics.mesh import SheetMesh
 from .dataset import Dataset
-from .grasped_frames import FrameHistory
+from .grasped_frames import Timed
 from .sheet import PredictedSheet
 
 NUISANCE = {
@@ -43,7 +46,7 @@ class Problem:
 
     sheet: PredictedSheet
     """Sheet with all effects of the library."""
-    history: FrameHistory
+    history: FrameHistory[Timed]
     """All frames."""
     prior: AttachmentBelief
     """Prior of the attachments."""
@@ -60,13 +63,15 @@ class Problem:
 
     @classmethod
     def build(cls, dataset: Dataset, library: tuple[Effect, ...]) -> "Problem":
-        """Return the problem for a recording and the effects that the model may lack."""
+        """Return the problem for a recording and the effects that the model may lack; declared ones are among them."""
         estimator = dataset.estimator
         mesh = SheetMesh(estimator.sheet.rest, estimator.sheet.faces)
         energy, config = nominal_energy(mesh, estimator.declaration), estimator.config
         balance = force_balance(mesh, energy, estimator.declaration, config).inflated(FORCE_VARIANCE)
+        declared, names = declared_effects(estimator.declaration), {effect.name for effect in library}
+        library = (*library, *(effect for effect in LIBRARY if effect.name in declared.keys() - names))
         library = tuple(effect for effect in library if estimator.declaration.hangs or not effect.hanging)
-        sheet = PredictedSheet(balance=balance, view=centred(mesh), library=library)
+        sheet = PredictedSheet(balance=balance, view=centred(mesh), library=library, declared=declared)
         alike = replace(config.prior, sheet_strength=SHEET_STRENGTH)
         own = {name: sd for name, sd in NUISANCE.items() if any(effect.name == name for effect in library)}
         return cls(
@@ -102,9 +107,11 @@ class Problem:
         return np.concatenate([self.prior_sd[named], narrow])
 
     def lower_bounds(self, free: np.ndarray) -> Float[np.ndarray, " free"]:
-        """Return the lower bound of each parameter."""
-        lowest = [np.full(one.size, 0.0 if one.non_negative else -np.inf) for one in self.sheet.library]
-        return np.concatenate(lowest)[free]
+        """Return the lower bound of each parameter, below 0 by what is declared."""
+        lowest = np.concatenate([np.full(one.size, 0.0 if one.non_negative else -np.inf) for one in self.sheet.library])
+        for name, declared in self.sheet.declared.items():
+            lowest[self.sheet.place(name)] -= np.asarray(declared)
+        return lowest[free]
 
 
 @dataclass(frozen=True, kw_only=True)

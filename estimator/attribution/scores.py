@@ -102,7 +102,7 @@ def _score(
     unit, scaled = own.precision * np.outer(sd, sd), own.shift * sd
     posterior = GaussianInformation(precision=unit + eye, shift=scaled)
     theta = posterior.mean()
-    senseless = effect.non_negative and theta[0] < 0
+    senseless = sd[0] * theta[0] < problem.lower_bounds(mine)[0]
     evidence = (0.0 if senseless else 0.5 * scaled @ theta) - 0.5 * posterior.log_det()
     regularisation = SINGULAR * max(float(np.trace(unit)), MIN_TRACE)
     statistic = float(scaled @ np.linalg.solve(unit + regularisation * eye, scaled))

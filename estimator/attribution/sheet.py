@@ -1,18 +1,19 @@
 """Predict the sheet with all effects of a library: its equilibria, and how they are observed."""
 
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..effects.effect import Effect
-from ..effects.sheet_model import FrameContext, SheetModel, View, tangents
+from ..effects.effect import Effect, with_effects
+from ..effects.frame_history import FrameHistory
+from ..effects.sheet_model import FrameContext, SheetModel, View, look, without_view
 from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
 from ..parallel_map import parallel_map
-from ..physics.energy import SheetEnergy
-from ..physics.membrane import TriangleMembrane
-from .grasped_frames import ClosedFrame, FrameHistory
+from .grasped_frames import ClosedFrame, Timed
 
 GRIP_PRECISION = 1e6
 """Precision of the held particles' positions while a state is predicted [1/m^2]."""
@@ -31,6 +32,8 @@ class PredictedSheet(eqx.Module):
     """View without effects."""
     library: tuple[Effect, ...] = eqx.field(static=True)
     """Effects, which act on the model in this order."""
+    declared: Mapping[str, Float[np.ndarray, " _p"] | Float[Array, " _p"]] = eqx.field(default_factory=dict)
+    """Parameters of the declared effects, by name: parameters of the library are in addition to them."""
 
     @property
     def size(self) -> int:
@@ -61,22 +64,16 @@ class PredictedSheet(eqx.Module):
 
     def model(self, theta: Float[Array, " p"], context: FrameContext, tool: Float[Array, " 3"]) -> SheetModel:
         """Return the model of one frame with effects of parameters theta; `tool` is the reported displacement [m]."""
-        model, start = self.plain(context, tool), 0
-        for effect in self.library:
-            model = effect.acts(model, theta[start : start + effect.size], context)
-            start += effect.size
-        return model
+        for name, declared in self.declared.items():
+            theta = theta.at[self.place(name)].add(declared)
+        return with_effects(self.plain(context, tool), self.library, theta, context)
 
-    def balance_of(self, energy: SheetEnergy) -> ForceBalance:
-        """Return the force balance with a changed energy."""
-        springs = self.balance.tethered.energy.terms[-1]
-        changed = energy, energy.rest, (*energy.terms, springs)
-        return eqx.tree_at(lambda b: (b.energy, b.tethered.energy.rest, b.tethered.energy.terms), self.balance, changed)
-
-
-def look(model: SheetModel, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Return where particles at x are observed [m]."""
-    return model.view(x, tangents=tangents(model.term(TriangleMembrane), x))
+    def depends_on_history(self, theta: Float[np.ndarray, " p"]) -> bool:
+        """Return whether frames with these parameters depend on their own states."""
+        return any(
+            effect.history_dependent and (effect.name in self.declared or np.any(theta[self.place(effect.name)]))
+            for effect in self.library
+        )
 
 
 def closed_on(
@@ -85,9 +82,7 @@ def closed_on(
     """Return where the jaws closed on the held particles, with the view's errors of that time removed [m]."""
     at_closing = (context.time - context.closed, jnp.zeros_like(context.closed))
     model = sheet.model(theta, eqx.tree_at(lambda m: (m.time, m.closed), context, at_closing), frame.displacement)
-    along = tangents(model.term(TriangleMembrane), context.rest)
-    slid = model.view.points(context.rest, along) - context.rest
-    return 2 * frame.rotated - model.view.moved(frame.rotated + slid)
+    return without_view(model, context.rest, frame.rotated)
 
 
 def tool_residual(
@@ -148,7 +143,7 @@ def predict(
     precision = jnp.broadcast_to(GRIP_PRECISION * jnp.eye(3)[None], (len(s), 3, 3))
     grip = Evidence(y=to, precision=precision, held=frame.held, force_unknown=frame.force_unknown)
     begin = jnp.where(frame.held[:, None], to, start)
-    x = sheet.balance_of(model.energy).predict(begin, s, grip)
+    x = sheet.balance.with_energy(model.energy).predict(begin, s, grip)
     return Predicted(x=x, seen=look(model, x))
 
 
@@ -156,7 +151,7 @@ def predict_all(
     sheet: PredictedSheet,
     theta: np.ndarray,
     s: np.ndarray,
-    history: FrameHistory,
+    history: FrameHistory[Timed],
     states: Float[np.ndarray, "frames n 3"],
     *,
     only: list[int] | None = None,
@@ -180,11 +175,7 @@ def predict_all(
     """
     grasps = history.by(lambda one: one.grasp, range(len(history.frames)) if only is None else only)
     predicted, seen = states.copy(), np.full(states.shape, np.nan)
-    rounds = (
-        max_predictions
-        if any(effect.history_dependent and np.any(theta[sheet.place(effect.name)]) for effect in sheet.library)
-        else 1
-    )
+    rounds = max_predictions if sheet.depends_on_history(theta) else 1
     at, stiffnesses, use_tool = jnp.asarray(theta), jnp.asarray(s), jnp.asarray(by_tool)
 
     def predict_grasp(grasp: int) -> None:

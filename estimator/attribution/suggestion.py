@@ -15,16 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..effects.frame_history import USUAL_GAP, FrameHistory
+from ..effects.sheet_model import look
 from ..physics.mesh import farthest_points
 from ..planning.information_config import SLANTED, UP, InformationPolicyConfig
 from .close_loop import Closed
 from .dataset import Dataset
 from .every_frame import cost_under, weighed
 from .fit import Fitted
-from .grasped_frames import USUAL_GAP, ClosedFrame, FrameHistory, Timed
+from .grasped_frames import ClosedFrame, Timed
 from .held_out import from_rest
 from .problem import Point, Problem
-from .sheet import look
 
 N_SLANTED_PLACES = 3
 """Number of places from which slanted pulls are tried, the best by their lifts."""

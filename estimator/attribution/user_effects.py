@@ -6,9 +6,8 @@ import numpy as np
 
 from ..effects import LIBRARY
 from ..effects.effect import Effect
-from ..effects.sheet_model import FrameContext, SheetModel
+from ..effects.sheet_model import FrameContext, SheetModel, look
 from .problem import Problem
-from .sheet import look
 
 ROUNDING = 1e-9
 """Change of a force [N] or position [m] that counts as none."""

@@ -20,7 +20,7 @@ A user can add an effect without touching the library: pass `(*LIBRARY, mine)` t
 `attribution.user_effects.check_effects` before any fit.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from jaxtyping import Array, Float
@@ -66,6 +66,8 @@ class Effect:
     """Whether it applies only to a sheet with weight and no bed under it."""
     sensing: bool = False
     """Whether it is of the tool, the camera or the tracker; its size then holds for one session alone."""
+    needs_later_reports: bool = False
+    """Whether it needs what the tool reports after the frame, which an estimate does not have yet."""
 
     def __post_init__(self) -> None:
         """Check what a user may have given."""
@@ -88,3 +90,14 @@ class Effect:
     def size(self) -> int:
         """Return the number of parameters, those of all sites together."""
         return self.sites * len(self.prior_sd)
+
+
+def with_effects(
+    model: SheetModel, effects: Iterable[Effect], theta: Float[Array, " p"], context: FrameContext
+) -> SheetModel:
+    """Return the model after all effects have acted on it in turn; theta holds their parameters one after the other."""
+    start = 0
+    for effect in effects:
+        model = effect.acts(model, theta[start : start + effect.size], context)
+        start += effect.size
+    return model

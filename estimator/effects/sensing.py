@@ -145,6 +145,7 @@ SENSING = (
         confounded_with=("image_latency", "tool_scale"),
         non_negative=True,
         sensing=True,
+        needs_later_reports=True,
     ),
     Effect(
         name="image_latency",

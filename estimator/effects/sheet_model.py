@@ -88,6 +88,20 @@ class SheetModel(eqx.Module):
         return eqx.tree_at(lambda model: model.energy.terms, self, terms)
 
 
+def look(model: SheetModel, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Return where particles at x are observed [m]."""
+    return model.view(x, tangents=tangents(model.term(TriangleMembrane), x))
+
+
+def without_view(model: SheetModel, rest: Float[Array, "n 3"], closed: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Return where the jaws closed [m], from where it was observed then by the view of `model`.
+
+    The sheet lies as at rest then, but for what the grip moves, so that points have slid along it as along that.
+    """
+    along = tangents(model.term(TriangleMembrane), rest)
+    return 2 * closed - model.view.moved(closed + model.view.points(rest, along) - rest)
+
+
 class FrameContext(eqx.Module):
     """What an effect may know of a frame."""
 

@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jiggle_mj.estimator.attribution.fit import Fitted
-from jiggle_mj.estimator.attribution.grasped_frames import ClosedFrame, FrameHistory, Timed
+from jiggle_mj.estimator.attribution.grasped_frames import ClosedFrame, Timed
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import PredictedSheet
 from jiggle_mj.estimator.belief.gaussian_belief import GaussianBelief
 from jiggle_mj.estimator.effects import LIBRARY
+from jiggle_mj.estimator.effects.frame_history import FrameHistory
 from jiggle_mj.estimator.effects.sheet_model import centred
 from jiggle_mj.estimator.filters.posterior_summary import Convergence, PosteriorSummary
 from tests.support.small_sheet import sheet, sheet_balance, sheet_prior
