@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from .plausibility.problems import problems as problems
     from .plausibility.survey import Survey as Survey
     from .plausibility.survey import survey as survey
+    from .recording.declaration_file import read_declaration as read_declaration
     from .recording.reader import Recording as Recording
     from .recording.writer import RecordingWriter as RecordingWriter
     from .series import RecordingSeries as RecordingSeries
@@ -117,6 +118,7 @@ __all__ = [
     "load_scene",
     "problems",
     "programme",
+    "read_declaration",
     "record_series",
     "run_estimator",
     "run_scene",
@@ -162,6 +164,7 @@ _NAMES_OF_MODULE = {
     "plausibility.problem": ("RecordingProblem",),
     "plausibility.problems": ("problems",),
     "plausibility.survey": ("Survey", "survey"),
+    "recording.declaration_file": ("read_declaration",),
     "recording.reader": ("Recording",),
     "recording.writer": ("RecordingWriter",),
     "series": ("RecordingSeries", "record_series"),

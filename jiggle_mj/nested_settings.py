@@ -53,6 +53,15 @@ def nested(assignments: Mapping[str, Any]) -> dict[str, Any]:
     return tables
 
 
+def leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and the value of each entry of a table, those of its tables included."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
 def _changed(config: T, table: Mapping[str, Any], *, where: str, prefix: str, known: list[str]) -> T:
     names = {field.name for field in fields(config)}  # pyright: ignore[reportArgumentType]
     kinds, changes = get_type_hints(type(config)), {}
@@ -65,7 +74,7 @@ def _changed(config: T, table: Mapping[str, Any], *, where: str, prefix: str, kn
             if not isinstance(value, Mapping):
                 raise OptionError(f"{where}: {name} is a table of settings, such as {name}.{fields(current)[0].name}.")
             changes[key] = _changed(current, value, where=where, prefix=f"{name}.", known=known)
-        elif isinstance(value, Mapping) and value:
+        elif isinstance(value, Mapping) and value and get_origin(kinds[key]) is not Mapping:
             inner = f"{name}.{next(iter(value))}"
             raise OptionError(f"{where}: unknown setting '{inner[:MAX_SHOWN]}'{_meant(inner, known)}")
         else:
@@ -85,13 +94,17 @@ def _meant(name: str, known: list[str]) -> str:
 
 
 def _typed(value: Any, kind: Any, where: str) -> Any:
-    """Return a value of a field's type: number, text, truth value, one of several texts, or a tuple of numbers."""
+    """Return a value of a field's type: number, text, truth value, one of several texts, tuple, or table of these."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         kinds = [each for each in arguments if each is not type(None)]
         return _typed(value, kinds[0], where)
     allowed = str(getattr(kind, "__name__", kind))
-    if origin is Literal:
+    if origin is Mapping:
+        if isinstance(value, Mapping):
+            return {name: _typed(item, arguments[1], f"{where}.{name}") for name, item in leaves(value)}
+        allowed = "a table of names"
+    elif origin is Literal:
         if value in arguments:
             return value
         allowed = f"one of {', '.join(map(repr, arguments))}"

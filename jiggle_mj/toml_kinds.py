@@ -145,6 +145,13 @@ def vector(value: Any) -> list[float]:
     return [number(item) for item in value]
 
 
+def numbers(value: Any) -> list[float]:
+    """Return a list of numbers."""
+    if not isinstance(value, list):
+        raise TypeError("a list of numbers")
+    return [number(item) for item in value]
+
+
 def matrix(value: Any) -> list[list[float]]:
     """Return three rows of three numbers."""
     if not isinstance(value, list) or len(value) != 3:

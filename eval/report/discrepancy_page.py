@@ -58,6 +58,8 @@ def story(found: Mapping[str, Any]) -> list[str]:
         if rivals := effect["indistinguishable_from"]:
             sentences.append(f"These frames do not distinguish {effect['name']} from: {', '.join(rivals)}.")
     sentences += [f"Refused: {effect['name']}, because {effect['why']}." for effect in found["refused"]]
+    if found["effects"]:
+        sentences.append("The model with it is in corrected.toml; estimate --declare corrected.toml uses it.")
     sentences += _held_out_sentences(found)
     if found["suggestion"] is not None:
         sentences.append(_suggestion_sentence(found["suggestion"]))

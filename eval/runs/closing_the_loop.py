@@ -1,4 +1,4 @@
-"""Closes the loop over a recording: files in, `discrepancy.json` and a page of pictures out.
+"""Closes the loop over a recording: files in, `discrepancy.json`, a page of pictures and the corrected model out.
 
 A truth file, if given, is opened after everything is decided and written. It only adds the detection figures before and
 after.
@@ -19,6 +19,7 @@ from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.estimator.attribution.close_loop import close_the_loop
+from jiggle_mj.estimator.attribution.corrected import corrected_parameters
 from jiggle_mj.estimator.attribution.dataset import collect_dataset
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
 from jiggle_mj.estimator.attribution.suggestion import suggest
@@ -36,6 +37,7 @@ from ..metrics.result_file import Json
 from ..metrics.truth_transfer import transfer
 from ..report.discrepancy_page import write_page
 from .check_before import check_before
+from .corrected_files import CORRECTED, PARAMETERS, write_corrected
 from .settings_used import settings_used, with_declared
 
 DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
@@ -63,7 +65,7 @@ def close_loop(
 
     Args:
         recording_path: the MCAP file.
-        directory: where discrepancy.json and discrepancy.html go.
+        directory: where discrepancy.json, discrepancy.html, corrected.toml and parameters.yaml go.
         truth: a truth file, to score the detected attachments before and after; opened after everything is decided.
         library: effects that are tested; `(*LIBRARY, mine)` adds one.
         suggestion: search the pull that best distinguishes the effects that these frames do not.
@@ -86,7 +88,7 @@ def close_loop(
     """
     recording_path, directory = as_path(recording_path, "the recording"), as_path(directory, "the folder")
     recording = Recording.open(recording_path, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
-    own = (DISCREPANCY, PAGE)
+    own = (DISCREPANCY, PAGE, CORRECTED, PARAMETERS)
     check_directory(directory, own, overwrite=overwrite)
     declaration = with_declared(recording.declaration, declare)
     check_before(recording, recording_path, declare, allow_implausible=allow_implausible, log=log)
@@ -102,6 +104,7 @@ def close_loop(
         write_text(directory / DISCREPANCY, json.dumps(found, indent=1) + "\n")
         write_page(directory / PAGE, name=name, sheet=sheet, found=found)
 
+    write_corrected(directory, corrected_parameters(closed, declaration), declaration, name=name)
     write()
     if truth is not None:
         opened = read_truth(truth, allow_truncated=allow_truncated)

@@ -40,6 +40,8 @@ def settings_used(
     origin = "recording" if declared else "default"
     defaults = dict(dotted(EstimatorConfig()))
     properties = {field.name: getattr(declaration, field.name) for field in fields(declaration) if field.name != "mesh"}
+    if not declaration.effects:
+        del properties["effects"]
     return {
         "declaration": {
             name: {"value": list(value) if isinstance(value, tuple) else value,

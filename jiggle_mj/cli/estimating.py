@@ -204,7 +204,7 @@ def close_loop(
 
     Args:
         recording: an MCAP file of observations.
-        out: folder for discrepancy.json and discrepancy.html.
+        out: folder for discrepancy.json, discrepancy.html, corrected.toml and parameters.yaml.
         truth: a truth file, to score the detected attachments before and after; it is read after the verdict.
         suggest: where several effects explain the frames, search the next pull that discriminates between them.
         settings: what is declared of the tissue, how the estimator is set, and which pixels are tissue.

@@ -37,9 +37,9 @@ def in_ns(tolerance_ms: float) -> int:
 class SettingOptions:
     """Options on what is assumed of the tissue, and on the estimator's settings."""
 
-    declare: tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")]] = ()
-    """A property of the tissue that you know, such as membrane_stiffness=20 [N/m]; over what the recording or scene
-    declares. May be repeated."""
+    declare: tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE|FILE.toml")]] = ()
+    """A property of the tissue that you know, such as membrane_stiffness=20 [N/m], or a file of them, such as the
+    corrected.toml of close-loop; over what the recording or scene declares. May be repeated."""
     config: Path | None = None
     """A TOML file with settings of the estimator; its tables are those of EstimatorConfig."""
     set: tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")]] = ()

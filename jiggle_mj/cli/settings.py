@@ -6,29 +6,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MAX_SHOWN, OptionError
-from ..nested_settings import nested, with_settings
+from ..nested_settings import leaves, nested, with_settings
 from ..options import FilterName
+from ..recording.settings_file import read_table
 
 if TYPE_CHECKING:
     from jiggle_mj.estimator import EstimatorConfig
 
-MAX_FILE_BYTES = 2**20
-"""Largest file of settings [bytes]."""
+FILE_SUFFIX = ".toml"
+"""End of what `--declare` takes for a file."""
 
 
-def declared(assignments: Iterable[str]) -> dict[str, Any]:
-    """Return the declared properties of `--declare NAME=VALUE` by name.
+def declared(given: Iterable[str]) -> dict[str, Any]:
+    """Return the declared properties of `--declare NAME=VALUE` and `--declare FILE.toml` by name, the last one counts.
 
     Raises:
-        OptionError: no assignment, an unknown name, or a value that a declaration refuses.
+        OptionError: no assignment, a file that cannot be read, an unknown name, or a value that a declaration refuses.
     """
-    from ..observation import Declaration
+    from ..recording.declaration_file import checked_properties
 
-    given = _assignments(assignments, "--declare")
-    if "mesh" in given:
-        raise OptionError("--declare mesh: a mesh is declared in the recording; see [mesh] in docs/RECORDINGS.md.")
-    checked = with_settings(Declaration(), given, where="--declare")
-    return {name: getattr(checked, name) for name in given}
+    values: dict[str, Any] = {}
+    for text in given:
+        is_file = Path(text).suffix == FILE_SUFFIX
+        values |= dict(leaves(read_table(Path(text), "--declare"))) if is_file else _assignments([text], "--declare")
+    return checked_properties(nested(values), where="--declare")
 
 
 def configured(path: Path | None, assignments: Iterable[str], estimator: FilterName) -> "EstimatorConfig":
@@ -46,19 +47,8 @@ def configured(path: Path | None, assignments: Iterable[str], estimator: FilterN
 
     config = EstimatorConfig(filter=estimator)
     if path is not None:
-        config = with_settings(config, _table(path), where=f"--config {path}")
+        config = with_settings(config, read_table(path, "--config"), where=f"--config {path}")
     return with_settings(config, nested(_assignments(assignments, "--set")), where="--set")
-
-
-def _table(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise OptionError(f"--config {path} is larger than {MAX_FILE_BYTES} bytes; is it a file of settings?")
-        return tomllib.loads(path.read_text())
-    except OSError as failure:
-        raise OptionError(f"--config {path} cannot be read: {failure.strerror}.") from failure
-    except (ValueError, RecursionError) as failure:
-        raise OptionError(f"--config {path} is no TOML: {str(failure)[:MAX_SHOWN]}.") from failure
 
 
 def _assignments(texts: Iterable[str], option: str) -> dict[str, Any]:

@@ -30,6 +30,8 @@ from .points.text_lines import read_text
 from .tool_force import GivenForce, read_force_table
 from .units import LENGTH_UNITS, TIME_UNITS, unit_of
 
+NOT_IN_TABLE = ("mesh", "effects")
+"""Fields of a declaration that its table does not hold."""
 MAX_ROTATION_ERROR = 2e-5
 """Largest entry of R R^T - 1 of a rotation: the rounding of five decimals."""
 MAX_MARGIN_M = 10.0
@@ -322,7 +324,8 @@ def parse_declaration_table(table: StrictTable) -> Declaration:
     Raises:
         RecordingError: an unknown key, a value of the wrong kind, or one that `Declaration` refuses.
     """
-    allowed: dict[str, Callable[[Any], Any]] = {f.name: kinds.number for f in fields(Declaration) if f.name != "mesh"}
+    allowed: dict[str, Callable[[Any], Any]] = {field.name: kinds.number for field in fields(Declaration)}
+    allowed = {name: kind for name, kind in allowed.items() if name not in NOT_IN_TABLE}
     allowed |= {"gravity": kinds.vector, "bed": kinds.flag}
     values = {name: table.take(name, kind) for name, kind in allowed.items() if name in table.values}
     table.known |= set(allowed)

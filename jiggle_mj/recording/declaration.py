@@ -16,7 +16,7 @@ from mcap.records import Attachment
 from ..argument_checks import quoted
 from ..errors import RecordingError
 from ..observation import MAX_PARTICLES, Declaration, DeclaredMesh
-from ..toml_kinds import MAX_COUNT, flag, number, positive, vector
+from ..toml_kinds import MAX_COUNT, flag, number, numbers, positive, table, vector
 from .json_values import entry, parse_object
 from .mcap_files import McapOutput, read_arrays
 from .stored_arrays import StoredArrays
@@ -34,6 +34,7 @@ KINDS = {
     "areal_density": positive,
     "gravity": vector,
     "bed": flag,
+    "effects": table,
 }
 """Kind of each field of a declaration but its mesh."""
 IDENTITY_DIGITS = 16
@@ -66,7 +67,9 @@ def identity(*parts: object) -> str:
 
 def write_declaration(output: McapOutput, declaration: Declaration) -> None:
     """Write a declaration, and its mesh where it has one."""
-    values = {f.name: getattr(declaration, f.name) for f in fields(declaration) if f.name != "mesh"}
+    values = {f.name: getattr(declaration, f.name) for f in fields(declaration) if f.name not in ("mesh", "effects")}
+    if declaration.effects:
+        values["effects"] = dict(declaration.effects)
     output.metadata(DECLARATION, {"json": json.dumps(values, sort_keys=True, allow_nan=False)})
     if declaration.mesh is not None:
         arrays = {f.name: getattr(declaration.mesh, f.name) for f in fields(declaration.mesh)}
@@ -87,6 +90,9 @@ def parse_declaration(text: str) -> Declaration:
     known = {name: entry(values, name, KINDS[name], where) for name in values}
     if "gravity" in known:
         known["gravity"] = tuple(known["gravity"])
+    if "effects" in known:
+        effects = known["effects"]
+        known["effects"] = {name: tuple(entry(effects, name, numbers, f"{where}: effects")) for name in effects}
     try:
         return Declaration(**known)
     except ValueError as failure:
