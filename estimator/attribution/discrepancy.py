@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jiggle_mj.estimate import Detection
+
 from .close_loop import Closed
 from .dataset import Dataset
 from .held_out import rms
@@ -65,9 +67,22 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
         "frames": {"used": len(dataset.frames), "left_out": list(dataset.left_out)},
         "localisation": before,
         "localisation_after": before if closed.final is first.fitted else localisation(closed.problem, closed.final),
+        "attachments": {"from": "fit", "why": None},
         "suggestion": None,
         "detection_before": None,
         "detection_after": None,
+    }
+
+
+def attachments(found: dict[str, Any], detection: Detection | str) -> dict[str, Any]:
+    """Return what changes in the result with an estimate under the corrected model, or with why there is none."""
+    if isinstance(detection, str):
+        return {"attachments": {"from": "fit", "why": detection}}
+    after = found["localisation_after"]
+    particles = {"p_attached": detection.score.tolist(), "attached": detection.attached.tolist()}
+    return {
+        "attachments": {"from": "estimate", "why": None},
+        "localisation_after": after | {"particles": after["particles"] | particles},
     }
 
 

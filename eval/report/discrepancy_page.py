@@ -60,6 +60,7 @@ def story(found: Mapping[str, Any]) -> list[str]:
     sentences += [f"Refused: {effect['name']}, because {effect['why']}." for effect in found["refused"]]
     if found["effects"]:
         sentences.append("The model with it is in corrected.toml; estimate --declare corrected.toml uses it.")
+        sentences.append(_attachments_sentence(found))
     sentences += _held_out_sentences(found)
     if found["suggestion"] is not None:
         sentences.append(_suggestion_sentence(found["suggestion"]))
@@ -103,6 +104,14 @@ def _held_out_sentences(found: Mapping[str, Any]) -> list[str]:
     if least < remainder:
         sentences.append(f"That {words} predicts this part better than the model does: do not rely on its attachments.")
     return sentences
+
+
+def _attachments_sentence(found: Mapping[str, Any]) -> str:
+    """Return what the attachments after are from."""
+    if found["attachments"]["from"] == "estimate":
+        return "The attachments after are those of an estimate with it."
+    why = found["attachments"]["why"] or "where a residual stays unexplained, it counts less than in an estimate"
+    return f"The attachments after are those of the fit: {why.removesuffix('.')}."
 
 
 def _suggestion_sentence(suggestion: Mapping[str, Any]) -> str:

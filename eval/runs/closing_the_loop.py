@@ -18,10 +18,10 @@ from jiggle_mj.episode import OnFrame, check_directory, clear_directory
 from jiggle_mj.errors import RecordingError
 from jiggle_mj.estimate import Sheet
 from jiggle_mj.estimator import EstimatorConfig
-from jiggle_mj.estimator.attribution.close_loop import close_the_loop
-from jiggle_mj.estimator.attribution.corrected import corrected_parameters
+from jiggle_mj.estimator.attribution.close_loop import UNEXPLAINED, close_the_loop
+from jiggle_mj.estimator.attribution.corrected import corrected_declaration, corrected_parameters
 from jiggle_mj.estimator.attribution.dataset import collect_dataset
-from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
+from jiggle_mj.estimator.attribution.discrepancy import attachments, discrepancy, suggested
 from jiggle_mj.estimator.attribution.suggestion import suggest
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
@@ -37,6 +37,7 @@ from ..metrics.result_file import Json
 from ..metrics.truth_transfer import transfer
 from ..report.discrepancy_page import write_page
 from .check_before import check_before
+from .corrected_estimate import corrected_detection
 from .corrected_files import CORRECTED, PARAMETERS, write_corrected
 from .settings_used import settings_used, with_declared
 
@@ -104,15 +105,24 @@ def close_loop(
         write_text(directory / DISCREPANCY, json.dumps(found, indent=1) + "\n")
         write_page(directory / PAGE, name=name, sheet=sheet, found=found)
 
-    write_corrected(directory, corrected_parameters(closed, declaration), declaration, name=name)
+    added = corrected_parameters(closed, declaration)
+    write_corrected(directory, added, declaration, name=name)
     write()
+    attached = {"before": closed.contexts[0].fitted.attached, "after": closed.final.attached}
+    if added and closed.verdict not in UNEXPLAINED:
+        log("estimating under the corrected model")
+        corrected = corrected_declaration(added, declaration)
+        detection = corrected_detection(recording, corrected, config=config, mask=mask)
+        found |= attachments(found, detection)
+        attached["after"] = np.array(found["localisation_after"]["particles"]["attached"])
+        write()
     if truth is not None:
         opened = read_truth(truth, allow_truncated=allow_truncated)
         if opened.identity != recording.metadata.get("identity", ""):
             raise RecordingError(f"{truth} is not the truth of {recording_path}; give the one written with it.")
         last = dataset.frames[-1].index
-        for when, fitted in (("before", closed.contexts[0].fitted), ("after", closed.final)):
-            found[f"detection_{when}"] = _detection(sheet, fitted.attached, opened, last)
+        for when, particles in attached.items():
+            found[f"detection_{when}"] = _detection(sheet, particles, opened, last)
         write()
     if suggestion:
         with jax.enable_x64(True), one_thread():

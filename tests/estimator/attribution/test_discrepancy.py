@@ -1,20 +1,23 @@
 """Content of discrepancy.json, its page, and the suggested pull."""
 
+import dataclasses
 import json
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
+import jiggle_mj as jm
 from jiggle_mj.estimate import Sheet
-from jiggle_mj.estimator.attribution.discrepancy import discrepancy, suggested
+from jiggle_mj.estimator.attribution.corrected import corrected_parameters
+from jiggle_mj.estimator.attribution.discrepancy import attachments, discrepancy, suggested
 from jiggle_mj.estimator.attribution.suggestion import expected_log_bayes_factor, suggest
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.eval.report.discrepancy_page import story, write_page
 from jiggle_mj.eval.runs import closing_the_loop as closing_run
-from jiggle_mj.observation import Declaration
-from tests.support.small_sheet import sheet
+from jiggle_mj.eval.runs.corrected_files import CORRECTED
+from tests.support.lifted_recording import observed
+from tests.support.small_sheet import DECLARATION, attached, sheet
 
 
 def test_the_file_and_the_page_hold_the_result(light, tmp_path):
@@ -29,23 +32,66 @@ def test_the_file_and_the_page_hold_the_result(light, tmp_path):
     assert f"Added: {found['effects'][0]['name']}" in (tmp_path / "a.html").read_text()
 
 
-def test_the_result_is_written_before_a_pull_is_searched_for(light, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def stopped_run(light, tmp_path_factory):
+    """Return the folder of a closed loop that was stopped as it began to search for a pull, and its recording."""
     closed, _, dataset = light
-    recording = SimpleNamespace(declaration=Declaration(), declared=True, camera=None, metadata={"name": "light"})
+    folder = tmp_path_factory.mktemp("light")
 
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(closing_run.Recording, "open", staticmethod(lambda *_, **__: recording))
-    monkeypatch.setattr(closing_run, "check_before", lambda *_, **__: None)
-    monkeypatch.setattr(closing_run, "collect_dataset", lambda *_, **__: dataset)
-    monkeypatch.setattr(closing_run, "close_the_loop", lambda *_, **__: closed)
-    monkeypatch.setattr(closing_run, "suggest", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        closing_run.close_loop(tmp_path / "run.mcap", tmp_path / "closed", suggestion=True)
-    kept = json.loads((tmp_path / "closed" / closing_run.DISCREPANCY).read_text())
-    assert kept["verdict"] == closed.verdict and kept["suggestion"] is None
-    assert "gravity" in (tmp_path / "closed" / closing_run.PAGE).read_text()
+    with jm.RecordingWriter(folder / "run.mcap", camera=None, declaration=DECLARATION, metadata={}) as writer:
+        for observation in observed(0.2):
+            writer.write(observation)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(closing_run, "check_before", lambda *_, **__: None)
+        patch.setattr(closing_run, "collect_dataset", lambda *_, **__: dataset)
+        patch.setattr(closing_run, "close_the_loop", lambda *_, **__: closed)
+        patch.setattr(closing_run, "suggest", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            closing_run.close_loop(folder / "run.mcap", folder / "closed", suggestion=True)
+    return folder / "closed", folder / "run.mcap"
+
+
+def test_the_result_is_written_before_a_pull_is_searched_for(light, stopped_run):
+    folder, _ = stopped_run
+    kept = json.loads((folder / closing_run.DISCREPANCY).read_text())
+    assert kept["verdict"] == light[0].verdict and kept["suggestion"] is None
+    page = (folder / closing_run.PAGE).read_text()
+    assert "gravity" in page and "corrected.toml" in page
+
+
+def test_the_corrected_model_holds_the_fitted_effects_within_their_bounds(light, stopped_run):
+    closed, found, _ = light
+    declared = jm.read_declaration(stopped_run[0] / CORRECTED)
+    assert declared["effects"] == {one["name"]: tuple(one["theta"]) for one in found["effects"]}
+    assert declared["membrane_stiffness"] == DECLARATION.membrane_stiffness
+    for name, one in corrected_parameters(closed, DECLARATION).items():
+        sd = np.array(one.effect.prior_sd)
+        np.testing.assert_array_equal(one.value, declared["effects"][name])
+        np.testing.assert_allclose(one.max_value, 4 * sd)
+        np.testing.assert_allclose(one.min_value, -4 * sd)
+
+
+def test_the_reported_attachments_are_those_of_an_estimate_under_the_corrected_model(stopped_run):
+    folder, recording = stopped_run
+    found = json.loads((folder / closing_run.DISCREPANCY).read_text())
+    declared = dataclasses.replace(DECLARATION, **jm.read_declaration(folder / CORRECTED))
+    estimator = jm.Estimator(declared)
+    for observation in jm.Recording.open(recording):
+        estimator.update(observation)
+    estimator.release()
+    assert found["attachments"] == {"from": "estimate", "why": None}
+    assert found["localisation_after"]["particles"]["attached"] == estimator.detection.attached.tolist()
+    assert np.sum(estimator.detection.attached != attached()) <= 2
+
+
+def test_without_an_estimate_the_result_says_why(light):
+    _, found, _ = light
+    changed = found | attachments(found, "Declaration.effects: tool_latency cannot.")
+    assert changed["localisation_after"] == found["localisation_after"]
+    assert "those of the fit: Declaration.effects: tool_latency cannot." in " ".join(story(changed))
 
 
 @pytest.mark.slow
