@@ -20,10 +20,12 @@ PARTS = ("energy", "tool", "view")
 """Parts of a model that an effect may change."""
 PROBE_STRETCH = 1.01
 """Factor by which the sheet is larger than at rest in the frame that shows what an effect changes."""
-PROBE_TIMES = (1.0, 1.2, 1.3)
-"""Times of the tool's reports in that frame, the last one its own [s]."""
+PROBE_TIMES = (1e6, 1e6 + 0.2, 1e6 + 0.3)
+"""Times of the tool's reports in that frame, the last one its own [s]: later than any drift begins."""
 PROBE_DISPLACEMENTS = (0.0, 1e-3, 3e-3)
-"""Displacement along each axis that these report [m]."""
+"""Displacement along `PROBE_DIRECTION` that these report [m]."""
+PROBE_DIRECTION = (0.31, -0.55, 0.77)
+"""Direction of the tool in that frame, along no axis of a rotation that anybody would give."""
 
 
 class CorrectedModel(eqx.Module):
@@ -77,7 +79,8 @@ class CorrectedModel(eqx.Module):
     def changes(self, effect: Effect, part: str) -> bool:
         """Return whether one of the effects changes the model's `energy`, `tool` or `view`, in a frame of a lift."""
         start = sum(one.size for one in self.effects[: self.effects.index(effect)])
-        context, tool = _probe(self.energy.rest), jnp.full(3, PROBE_DISPLACEMENTS[-1])
+        context = _probe(self.energy.rest)
+        tool = context.reports[-1]
         plain = SheetModel(energy=self.energy, tool=tool, view=self.view, time=context.time)
         changed = effect.acts(plain, self.theta[start : start + effect.size], context)
         leaves = (jax.tree.leaves(getattr(model, part)) for model in (plain, changed))
@@ -135,7 +138,7 @@ def resting(rest: Float[Array, "n 3"], time: float = 0.0) -> FrameContext:
 
 def _probe(rest: Float[Array, "n 3"]) -> FrameContext:
     """Return the context of a frame in which everything moves, so that each effect shows."""
-    displacements = jnp.asarray(PROBE_DISPLACEMENTS)[:, None] * jnp.ones((1, 3))
+    displacements = jnp.outer(jnp.asarray(PROBE_DISPLACEMENTS), jnp.asarray(PROBE_DIRECTION))
     moving = _context(rest, PROBE_STRETCH * rest, times=jnp.asarray(PROBE_TIMES), displacements=displacements)
     return eqx.tree_at(lambda context: context.before, moving, rest)
 

@@ -98,7 +98,7 @@ def close_loop(
     used = settings_used(declaration, dataset.estimator.config, declare=declare, declared=recording.declared)
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(dataset, library=library, log=log)
-        found = version_entry() | discrepancy(closed, dataset) | {"settings": used}
+        found: dict[str, Any] = {**version_entry(), **discrepancy(closed, dataset), "settings": used}
     sheet, name = dataset.estimator.sheet, recording.metadata.get("name", recording_path.stem)
 
     def write() -> None:

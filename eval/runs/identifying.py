@@ -67,8 +67,8 @@ def _why_no_frames(estimated: EstimateRecording) -> str:
     if estimated.detection is None:
         return "ends before its belief"
     return (
-        "does not keep its frames (an older version wrote it, or it is of clouds, of tissue that was cut or sewn, or "
-        "too large)"
+        "does not keep its frames (an older version wrote it, or it is of clouds, of tissue that was cut or sewn, with "
+        "declared effects, or too large)"
     )
 
 

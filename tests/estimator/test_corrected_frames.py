@@ -10,7 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from jiggle_mj.errors import OptionError
 from jiggle_mj.estimator import Estimator, EstimatorConfig
+from jiggle_mj.estimator.attribution.dataset import collect_dataset
+from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.sheet import predict_all
 from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.estimator.filter_builder import build_filter
 from jiggle_mj.estimator.fusion import fuse
 from jiggle_mj.estimator.grip import GripHold
@@ -19,7 +23,7 @@ from jiggle_mj.estimator.perception.mesh_field import MeshField
 from jiggle_mj.estimator.tracked_sheet import unfolded
 from jiggle_mj.observation import MeasuredPoints, Observation
 from tests.support.lifted_recording import N_STILL, NOISE, lifted, observed
-from tests.support.small_sheet import DECLARATION, attached, cloud, sheet
+from tests.support.small_sheet import DECLARATION, STIFFNESS, attached, cloud, sheet
 
 CAMERA = (3e-3, -2e-3, 1e-3, 0.03, -0.02, 0.02)
 """Shift [m] and rotation [rad] of a moved camera: as wrong as a hand-eye calibration is."""
@@ -163,3 +167,33 @@ def _without_identities(observation: Observation) -> Observation:
     assert observation.points is not None
     points = MeasuredPoints(positions=cloud(observation.points.positions, observation.index, 0.0), sd=1e-4)
     return dataclasses.replace(observation, points=points)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return collect_dataset(DECLARATION, None, observed(1.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "theta"), [("friction", 0.4), ("anchor_creep", 0.5), ("tissue_creep", 0.3), ("material_damping", 0.3)]
+)
+def test_an_effect_that_depends_on_earlier_frames_counts_once_it_is_declared(name, theta, dataset, flawless):
+    """Frames predicted with the effect; the stiffness found with it is nearer to that of frames without it."""
+    library = tuple(effect for effect in LIBRARY if effect.name == name)
+    problem, s = Problem.build(dataset, library), attached() * STIFFNESS / (STIFFNESS + DECLARATION.membrane_stiffness)
+    states, recording = np.array([one.state for one in problem.history.frames]), observed(1.0)
+    with jax.enable_x64(True), one_thread():
+        for _ in range(2):  # each grasp has the other ones' states of the call before
+            states, _ = predict_all(
+                problem.sheet, np.full(problem.sheet.size, theta), s, problem.history, states, by_tool=True
+            )
+    for one, x in zip(problem.history.frames, states, strict=True):
+        noise = NOISE * np.random.default_rng(one.index).normal(size=x.shape)
+        points = dataclasses.replace(recording[one.index].points, positions=x + noise)
+        recording[one.index] = dataclasses.replace(recording[one.index], points=points)
+    undeclared, _ = followed(recording)
+    declared, _ = followed(recording, **{name: (theta,)})
+    np.testing.assert_array_equal(declared.detection.attached, attached())
+    expected = mean_b(flawless[0])
+    assert abs(mean_b(declared) - expected) < abs(mean_b(undeclared) - expected)

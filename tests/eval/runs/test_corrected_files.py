@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import json
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -19,6 +20,7 @@ from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.eval.runs.corrected_files import CORRECTED, PARAMETERS, parameters_text, write_corrected
 from jiggle_mj.eval.runs.settings_used import settings_used, with_declared
 from jiggle_mj.observation import Declaration
+from tests.support.tiny_scene import call, scene_file
 
 DECLARED = Declaration(membrane_stiffness=20.0, bed=False, gravity=(0.0, -9.81, 0.0), effects={"friction": (0.2,)})
 
@@ -132,6 +134,24 @@ def test_a_result_says_which_effects_were_declared():
 def test_what_declares_no_effect_is_refused(given, says):
     with pytest.raises(OptionError, match=says):
         declared(given)
+
+
+def test_a_policy_and_an_estimate_take_the_file(tmp_path, monkeypatch, capsys):
+    scene, file = scene_file(tmp_path), tmp_path / "corrected.toml"
+    file.write_text("[effects]\nstretch = [0.3]\ntool_scale = [0.02]\n")
+    given = ("--declare", file, "--declare", "effects.tool_scale=[0.05]", "--json")
+    run = ("run", scene, "--sensing", "particles", "--policy", "information", "--steps", "5", "--out", tmp_path / "run")
+    estimate = ("estimate", tmp_path / "run" / "run.mcap", "--out", tmp_path / "estimate", "--allow-implausible")
+    for verb in (run, estimate):
+        assert call(monkeypatch, *verb, *given) == 0
+        result = json.loads(capsys.readouterr().out)
+        effects = {"value": {"stretch": [0.3], "tool_scale": [0.05]}, "from": "argument"}
+        assert result["settings"]["declaration"]["effects"] == effects
+        assert result["frames"]["used"] > 0
+    file.write_text("[effects]\ntool_latency = [0.1]\n")
+    assert call(monkeypatch, *estimate[:3], tmp_path / "late", *given[:2]) == 2
+    assert "tool_latency needs what the tool reports after each frame" in capsys.readouterr().err
+    assert not (tmp_path / "late").exists()
 
 
 def at_rest() -> jm.Observation:
