@@ -69,7 +69,7 @@ class Hypothesis:
     @property
     def sensible(self) -> bool:
         """Return whether the size of all parameters is plausible under the prior."""
-        return bool(np.all(np.abs(self.theta) <= MAX_PRIOR_SDS * np.asarray(self.effect.prior_sd)))
+        return bool(np.all(np.abs(self.theta) <= MAX_PRIOR_SDS * np.asarray(self.effect.prior_sds[self.score.site])))
 
 
 @dataclass(frozen=True, kw_only=True)

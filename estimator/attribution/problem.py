@@ -79,7 +79,7 @@ class Problem:
             history=FrameHistory(dataset.frames, mesh.rest),
             prior=prior_belief(mesh, reference=float(balance.reference), config=alike, belief=config.belief),
             noise=dataset.fields,
-            prior_sd=np.concatenate([np.tile(effect.prior_sd, effect.sites) for effect in library]),
+            prior_sd=np.concatenate([np.ravel(effect.prior_sds) for effect in library]),
             own=np.concatenate([[], *(sheet.place(name) for name in own)]).astype(int),
             own_sd=np.concatenate([[], *(np.asarray(sd) for sd in own.values())]),
         )

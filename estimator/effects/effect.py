@@ -49,8 +49,10 @@ class Effect:
     prior_sd: tuple[float, ...]
     """Prior standard deviation of each parameter, in its unit; the prior mean is 0."""
     sites: int = 1
-    """Number of places or directions that the effect may have; it has one of them. `acts` takes the parameters of all
-    sites, one site after the other."""
+    """Number of places, directions or scales that the effect may have; it has one of them. `acts` takes the parameters
+    of all sites, one site after the other."""
+    site_prior_sd: tuple[tuple[float, ...], ...] = ()
+    """Prior standard deviations at each site where they differ; then `prior_sd` are those at the first."""
     initial_guesses: tuple[tuple[float, ...], ...] = ()
     """Parameters from which a fit may start as well, for an effect whose derivatives at 0 show little of it."""
     source: str
@@ -86,10 +88,25 @@ class Effect:
         if not all(sd > 0 for sd in self.prior_sd):
             raise ValueError(f"Effect {self.name}: prior_sd must be above 0; got {self.prior_sd}.")
 
+        if self.site_prior_sd and (
+            len(self.site_prior_sd) != self.sites
+            or self.site_prior_sd[0] != self.prior_sd
+            or any(len(sd) != len(self.prior_sd) or min(sd) <= 0 for sd in self.site_prior_sd)
+        ):
+            raise ValueError(
+                f"Effect {self.name}: site_prior_sd needs {len(self.prior_sd)} numbers above 0 for each of "
+                f"{self.sites} sites, first those of prior_sd; got {self.site_prior_sd}."
+            )
+
     @property
     def size(self) -> int:
         """Return the number of parameters, those of all sites together."""
         return self.sites * len(self.prior_sd)
+
+    @property
+    def prior_sds(self) -> tuple[tuple[float, ...], ...]:
+        """Return the prior standard deviations of the parameters at each site."""
+        return self.site_prior_sd or (self.prior_sd,) * self.sites
 
 
 def with_effects(

@@ -13,6 +13,10 @@ SMALL_ANGLE = 1e-3
 """Angle below which a rotation is computed by its series [rad]: the terms that are left out are below rounding."""
 BEGAN_SD = 2.0
 """Prior standard deviation of the time at which a drift begins, from the time of the rest shape [s]."""
+DRIFT_RATES = (1e-3, 1e-4, 1e-5)
+"""Prior standard deviations of the speed of a drift, of which one holds [m/s]: alike likely on a logarithmic scale."""
+DRIFT_ARM = 0.1
+"""Distance at which a drift's rotation moves a point as fast as its shift does [m]: a camera's from the sheet."""
 EDGE = 1e-6
 """Distance by which a sliding point may go beyond the edge, so that at rest it has derivatives both ways [m]."""
 
@@ -47,10 +51,11 @@ def _camera_bias(model: SheetModel, theta: Float[Array, " 6"], context: FrameCon
     return _with_pose(model, theta[:3], theta[3:])
 
 
-def _camera_drift(model: SheetModel, theta: Float[Array, " 7"], context: FrameContext) -> SheetModel:
-    """Shift and rotate like `camera_bias`, in proportion to the time since theta[6] [s]."""
-    duration = _duration(theta[6], context)
-    return _with_pose(model, duration * theta[:3], duration * theta[3:6])
+def _camera_drift(model: SheetModel, theta: Float[Array, " p"], context: FrameContext) -> SheetModel:
+    """Shift and rotate like `camera_bias`, in proportion to the time since theta[6] [s]; 7 parameters for each rate."""
+    drift = jnp.sum(theta.reshape(len(DRIFT_RATES), 7), axis=0)
+    duration = _duration(drift[6], context)
+    return _with_pose(model, duration * drift[:3], duration * drift[3:6])
 
 
 def _depth_scale(model: SheetModel, theta: Float[Array, " 4"], context: FrameContext) -> SheetModel:
@@ -117,6 +122,11 @@ def _rotation(rotation_vector: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     return jnp.eye(3) + sine * cross + versine * cross @ cross
 
 
+def _drift_sd(rate: float) -> tuple[float, ...]:
+    """Return the prior standard deviations of a drift's parameters at one rate [m/s]."""
+    return (*(rate,) * 3, *(rate / DRIFT_ARM,) * 3, BEGAN_SD)
+
+
 SENSING = (
     Effect(
         name="tool_bias",
@@ -179,8 +189,10 @@ SENSING = (
         name="camera_drift",
         acts=_camera_drift,
         units=("m/s", "m/s", "m/s", "rad/s", "rad/s", "rad/s", "s"),
-        prior_sd=(3e-4, 3e-4, 3e-4, 3e-3, 3e-3, 3e-3, BEGAN_SD),
-        source="an arm that sinks by millimetres in ten seconds",
+        prior_sd=_drift_sd(DRIFT_RATES[0]),
+        sites=len(DRIFT_RATES),
+        site_prior_sd=tuple(_drift_sd(rate) for rate in DRIFT_RATES),
+        source="an arm that sinks by a centimetre in ten seconds, or by a millimetre in a quarter of an hour",
         confounded_with=("point_slip", "camera_bias"),
         sensing=True,
     ),

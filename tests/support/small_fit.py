@@ -39,7 +39,7 @@ def small_problem() -> Problem:
         history=FrameHistory([timed], rest),
         prior=sheet_prior(),
         noise=np.zeros((n, 0)),
-        prior_sd=np.concatenate([np.tile(effect.prior_sd, effect.sites) for effect in LIBRARY]),
+        prior_sd=np.concatenate([np.ravel(effect.prior_sds) for effect in LIBRARY]),
         own=np.zeros(0, dtype=int),
         own_sd=np.zeros(0),
     )

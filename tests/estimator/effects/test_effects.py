@@ -93,7 +93,7 @@ def observables(effect: Effect, plain: SheetModel, context: FrameContext):
 def test_an_effect_changes_nothing_at_zero_and_its_derivatives_are_finite_differences(name, plain, context):
     effect = EFFECTS[name]
     with jax.enable_x64(True):
-        all_of, sd = observables(effect, plain, context), np.tile(effect.prior_sd, effect.sites)
+        all_of, sd = observables(effect, plain, context), np.ravel(effect.prior_sds)
         zero = jnp.zeros(effect.size)
         without = observables(dataclasses.replace(effect, acts=lambda model, theta, context: model), plain, context)(
             zero
@@ -194,6 +194,19 @@ def test_rotating_the_camera_rotates_about_the_middle(plain, context):
         np.testing.assert_allclose(seen - middle, np.column_stack([1e-3 - arm[:, 1], arm[:, 0], arm[:, 2]]), atol=EXACT)
 
 
+@pytest.mark.parametrize("site", range(EFFECTS["camera_drift"].sites))
+def test_a_drift_at_any_of_its_rates_is_a_pose_that_grows_with_time(site, plain, context):
+    rate, began = np.array([1e-4, 0.0, -2e-4, 0.0, 1e-3, 0.0]), 0.5
+    with jax.enable_x64(True):
+        theta = np.zeros((EFFECTS["camera_drift"].sites, 7))
+        theta[site] = [*rate, began]
+        drifted = EFFECTS["camera_drift"].acts(plain, jnp.asarray(theta.ravel()), context).view
+        pose = (float(context.time) - began) * rate
+        expected = EFFECTS["camera_bias"].acts(plain, jnp.asarray(pose), context).view
+        np.testing.assert_allclose(drifted.shift, expected.shift, atol=EXACT)
+        np.testing.assert_allclose(drifted.rotation, expected.rotation, atol=EXACT)
+
+
 def test_a_late_report_is_where_the_tool_was(plain, context):
     with jax.enable_x64(True):
         later = EFFECTS["tool_latency"].acts(plain, jnp.array([0.375]), context)
@@ -214,6 +227,8 @@ def test_a_rotated_displacement_keeps_its_length(plain, context):
         ({"units": ("m", "m")}, "one entry for each parameter; got 2 and 1"),
         ({"prior_sd": (0.0,)}, "prior_sd must be above 0"),
         ({"initial_guesses": ((1.0, 2.0),)}, "each of initial_guesses needs 1 parameters"),
+        ({"sites": 2, "site_prior_sd": ((1.0,),)}, "1 numbers above 0 for each of 2 sites"),
+        ({"sites": 2, "site_prior_sd": ((2.0,), (1.0,))}, "first those of prior_sd"),
     ],
 )
 def test_a_users_effect_is_checked(changed, says):
