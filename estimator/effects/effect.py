@@ -3,7 +3,8 @@
 To add an effect to the library:
 
 1. Choose the file: `mechanical.py` if it depends on the current shape alone, `history_dependent.py` if it depends on
-   earlier shapes, `sensing.py` if it is of the tool, the camera or the tracker.
+   earlier shapes, `yielding.py` if it stays once a limit is passed, `foundation.py` if it is of what is under the
+   sheet, `sensing.py` if it is of the tool, the camera or the tracker.
 2. Write a function `acts(model, theta, context)` that returns a changed `SheetModel`. `theta` are the parameters, and
    `context` holds what may be known of the frame. Change an existing term of the energy with `model.term(Kind)`,
    `equinox.tree_at` and `model.with_term`; or `model.tool` (the tool's displacement), `model.view` (how positions are
@@ -62,8 +63,8 @@ class Effect:
     non_negative: bool = False
     """Whether negative parameters are excluded."""
     history_dependent: bool = False
-    """Whether it depends on the frame's own state through `FrameContext.past`. Such a frame is predicted repeatedly
-    until its state converges."""
+    """Whether it depends on the frame's own state through `FrameContext.past` or `now`. Such a frame is predicted
+    repeatedly until its state converges."""
     hanging: bool = False
     """Whether it applies only to a sheet with weight and no bed under it."""
     sensing: bool = False
@@ -87,7 +88,6 @@ class Effect:
             )
         if not all(sd > 0 for sd in self.prior_sd):
             raise ValueError(f"Effect {self.name}: prior_sd must be above 0; got {self.prior_sd}.")
-
         if self.site_prior_sd and (
             len(self.site_prior_sd) != self.sites
             or self.site_prior_sd[0] != self.prior_sd

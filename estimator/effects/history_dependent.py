@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics.bending import IsometricBending
-from ..physics.environment import BedContact, Tether, Weight
+from ..physics.environment import BedContact, Weight
 from ..physics.membrane import TriangleMembrane
 from .effect import Effect
 from .sheet_model import FrameContext, SheetModel
-from .terms import DeadLoad, FrictionElements
+from .terms import FrictionElements
 
 
 def _friction(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
@@ -26,7 +26,7 @@ def _friction(model: SheetModel, theta: Float[Array, " 1"], context: FrameContex
 def _viscous_drag(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
     """Add a force against each particle's own velocity, theta k v."""
     k = model.term(TriangleMembrane).stiffness
-    return _tethered(model, context.before, jnp.full(len(context.rest), theta[0] * k / context.gap))
+    return model.tethered(context.before, jnp.full(len(context.rest), theta[0] * k / context.gap))
 
 
 def _inertia(model: SheetModel, theta: Float[Array, " 2"], context: FrameContext) -> SheetModel:
@@ -38,7 +38,7 @@ def _inertia(model: SheetModel, theta: Float[Array, " 2"], context: FrameContext
     velocity = (context.before - context.earlier) / context.earlier_gap
     decay = jnp.exp(-theta[1] * context.gap)
     free_motion = context.before + context.gap * decay * velocity
-    return _tethered(model, free_motion, theta[0] * mass / context.gap**2)
+    return model.tethered(free_motion, theta[0] * mass / context.gap**2)
 
 
 def _material_damping(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
@@ -70,18 +70,6 @@ def _anchor_creep(model: SheetModel, theta: Float[Array, " 1"], context: FrameCo
     """Let the anchors follow what they hold at the rate theta [1/s]."""
     crept = jnp.einsum("t,tni->ni", context.memory_weights(theta[0]), context.past - context.rest[None])
     return eqx.tree_at(lambda m: m.energy.rest, model, model.energy.rest + crept)
-
-
-def _tethered(model: SheetModel, to: Float[Array, "n 3"], stiffness: Float[Array, " n"]) -> SheetModel:
-    """Add a spring of some stiffness from each particle to its place in `to`.
-
-    It is a spring to where the tether is already, and a dead load that makes up for the difference.
-    """
-    tether, load = model.term(Tether), model.term(DeadLoad)
-    stiffer = tether.stiffness + stiffness[:, None, None] * jnp.eye(3, dtype=to.dtype)[None]
-    force = load.force + stiffness[:, None] * (to - tether.to)
-    sprung = model.with_term(eqx.tree_at(lambda t: t.stiffness, tether, stiffer))
-    return sprung.with_term(eqx.tree_at(lambda t: t.force, load, force))
 
 
 HISTORY_DEPENDENT = (
@@ -119,7 +107,7 @@ HISTORY_DEPENDENT = (
         units=("1/s",),
         prior_sd=(0.3,),
         source="skin loses half of its stress within the first second, and creeps for minutes",
-        confounded_with=("material_damping", "friction"),
+        confounded_with=("material_damping", "friction", "tissue_yield"),
         non_negative=True,
         history_dependent=True,
     ),
@@ -129,7 +117,7 @@ HISTORY_DEPENDENT = (
         units=("1/s",),
         prior_sd=(0.3,),
         source="loose fascia gives within seconds",
-        confounded_with=("attachments", "tissue_creep"),
+        confounded_with=("attachments", "tissue_creep", "anchor_yield", "substrate"),
         non_negative=True,
         history_dependent=True,
     ),

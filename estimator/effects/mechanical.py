@@ -10,7 +10,7 @@ from ..physics.environment import BedContact, Weight
 from ..physics.hanging import Tension
 from ..physics.membrane import TriangleMembrane, plane_stress
 from .effect import Effect
-from .sheet_model import FrameContext, SheetModel, extent, material_coordinates
+from .sheet_model import FrameContext, SheetModel, extent, material_coordinates, particle_areas
 from .terms import AdhesionFilm, DeadLoad
 
 STANDARD_GRAVITY = 9.80665
@@ -132,8 +132,8 @@ def _point_pull(model: SheetModel, theta: Float[Array, " pulls"], context: Frame
 def _adhesion(model: SheetModel, theta: Float[Array, " 1"], context: FrameContext) -> SheetModel:
     """Add an adhesion film of work theta [J/m^2]."""
     film, membrane = model.term(AdhesionFilm), model.term(TriangleMembrane)
-    area = jnp.zeros(len(context.rest)).at[membrane.vertices].add(membrane.area[:, None] / 3)
-    return model.with_term(eqx.tree_at(lambda t: t.work, film, film.work + theta[0] * area))
+    work = film.work + theta[0] * particle_areas(membrane, len(context.rest))
+    return model.with_term(eqx.tree_at(lambda t: t.work, film, work))
 
 
 def _stiffer(model: SheetModel, factor: Float[Array, "*f"]) -> SheetModel:
@@ -263,7 +263,7 @@ MECHANICAL = (
         units=("J/m^2",),
         prior_sd=(0.1,),
         source="a film of water, twice its surface tension",
-        confounded_with=("attachments",),
+        confounded_with=("attachments", "tethering"),
         non_negative=True,
     ),
 )

@@ -134,7 +134,7 @@ SENSING = (
         units=("m", "m", "m"),
         prior_sd=(2e-3, 2e-3, 2e-3),
         source="a surgical robot's tip is reported within 0.7 to 3 mm",
-        confounded_with=("camera_bias", "tool_latency"),
+        confounded_with=("camera_bias", "tool_latency", "grasp_slip"),
         sensing=True,
     ),
     Effect(
@@ -143,7 +143,7 @@ SENSING = (
         units=("log factor",),
         prior_sd=(0.1,),
         source="a lever that is a tenth longer than was measured",
-        confounded_with=("depth_scale", "tool_latency"),
+        confounded_with=("depth_scale", "tool_latency", "grasp_slip"),
         sensing=True,
     ),
     Effect(

@@ -87,6 +87,17 @@ class SheetModel(eqx.Module):
         terms = tuple(new if type(term) is type(new) else term for term in self.energy.terms)
         return eqx.tree_at(lambda model: model.energy.terms, self, terms)
 
+    def tethered(self, to: Float[Array, "n 3"], stiffness: Float[Array, " n"]) -> "SheetModel":
+        """Return the model with a spring of some stiffness [N/m] from each particle to its place in `to` [m].
+
+        It is a spring to where the tether is already, and a dead load that makes up for the difference.
+        """
+        tether, load = self.term(Tether), self.term(DeadLoad)
+        stiffer = tether.stiffness + stiffness[:, None, None] * jnp.eye(3, dtype=to.dtype)[None]
+        force = load.force + stiffness[:, None] * (to - tether.to)
+        sprung = self.with_term(eqx.tree_at(lambda t: t.stiffness, tether, stiffer))
+        return sprung.with_term(eqx.tree_at(lambda t: t.force, load, force))
+
 
 def look(model: SheetModel, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """Return where particles at x are observed [m]."""
@@ -179,8 +190,12 @@ def tangents(membrane: TriangleMembrane, x: Float[Array, "n 3"]) -> Float[Array,
     F = membrane.deformation(x[membrane.vertices])
     weighted = jnp.broadcast_to((membrane.area[:, None, None] * F)[:, None], (*membrane.vertices.shape, 3, 2))
     total = jnp.zeros((len(x), 3, 2), x.dtype).at[membrane.vertices].add(weighted)
-    area = jnp.zeros(len(x), x.dtype).at[membrane.vertices].add(membrane.area[:, None])
-    return total / area[:, None, None]
+    return total / (3 * particle_areas(membrane, len(x)))[:, None, None]
+
+
+def particle_areas(membrane: TriangleMembrane, n: int) -> Float[Array, " n"]:
+    """Return the share of the sheet's rest area of each of n particles [m^2], a third of its triangles'."""
+    return jnp.zeros(n, membrane.area.dtype).at[membrane.vertices].add(membrane.area[:, None] / 3)
 
 
 def material_coordinates(

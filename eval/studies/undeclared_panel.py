@@ -13,12 +13,14 @@ import numpy as np
 from jiggle_mj.options import Sensing
 from jiggle_mj.scenes import Scene, load_scene
 from jiggle_mj.scenes.disturbances.anchors import (
+    Adhesion,
     AnchorBreak,
     AnchorCreep,
     AnchorShift,
     AnchorYield,
     GraspSlip,
     PointPull,
+    Substrate,
 )
 from jiggle_mj.scenes.disturbances.reports import (
     CameraBias,
@@ -110,6 +112,11 @@ TOOL_TURN = np.radians(4)
 SHIFT = 0.003 * np.array([1.0, 0.3, 0.0]) / np.hypot(1.0, 0.3)
 """Displacement of the anchors [m]."""
 
+TETHERING = 5e3
+"""Stiffness of a hold that is spread over the sheet [N/m^3]."""
+NEVER_OFF = 0.1
+"""Distance at which a film comes off that never does in these lifts [m]."""
+
 INSIDE: dict[str, PanelRow] = {
     "gravity x 0.3": _inside("gravity", Gravity(magnitude=0.3, start=AFTER_STILL_FRAMES), size=(0.0, 0.0, 0.7)),
     "gravity leaning": _inside(
@@ -136,6 +143,13 @@ INSIDE: dict[str, PanelRow] = {
         size=tuple(SHIFT),
     ),
     "anchor creep": _inside("anchor_creep", AnchorCreep(magnitude=0.5), size=(0.5,)),
+    "anchors yield": _inside("anchor_yield", AnchorYield(magnitude=0.0015)),
+    "tissue yields": _inside("tissue_yield", TissueYield(magnitude=0.1)),
+    "grasp slips": _inside("grasp_slip", GraspSlip(magnitude=0.006)),
+    "substrate": _inside("substrate", Substrate(magnitude=5.0)),
+    "tethering": _inside(
+        "tethering", Adhesion(magnitude=TETHERING * NEVER_OFF**2 / 2, reach=NEVER_OFF), size=(TETHERING,)
+    ),
     "tool scale": _inside("tool_scale", ToolScale(magnitude=1.08), size=(-np.log(1.08),)),
     "tool turn": _inside("tool_turn", ToolTurn(magnitude=4.0), size=(0.0, -TOOL_TURN, 0.0)),
     "tool latency": _inside("tool_latency", ToolLatency(magnitude=0.2), UNSETTLED, size=(0.2,)),
@@ -175,9 +189,6 @@ IMAGES: dict[str, PanelRow] = {
 }
 """Rows of one effect each, seen by a stereo pair."""
 OUTSIDE: dict[str, PanelRow] = {
-    "grasp slips": PanelRow(disturbances=(GraspSlip(magnitude=0.006),)),
-    "tissue yields": PanelRow(disturbances=(TissueYield(magnitude=0.1),)),
-    "anchors yield": PanelRow(disturbances=(AnchorYield(magnitude=0.0015),)),
     "anchors break": PanelRow(disturbances=(AnchorBreak(magnitude=0.01),)),
 }
 """Rows of an effect that the library does not have."""
