@@ -56,6 +56,7 @@ FOUNDATION = (
         acts=_tethering,
         units=("N/m^3",),
         prior_sd=(1e5,),
+        initial_guesses=((1e4,),),  # at 0 attachments of all particles take its place
         source="fat of 0.75 kPa in shear under skin, a centimetre thick",
         confounded_with=("adhesion", "attachments"),
         non_negative=True,
