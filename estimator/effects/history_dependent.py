@@ -117,7 +117,7 @@ HISTORY_DEPENDENT = (
         units=("1/s",),
         prior_sd=(0.3,),
         source="loose fascia gives within seconds",
-        confounded_with=("attachments", "tissue_creep", "anchor_yield", "substrate"),
+        confounded_with=("attachments", "tissue_creep", "substrate"),
         non_negative=True,
         history_dependent=True,
     ),

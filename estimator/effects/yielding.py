@@ -81,7 +81,7 @@ YIELDING = (
         prior_sd=(0.5,),
         sites=len(ANCHOR_LIMITS),
         source="a share, from 0 where nothing yields to 1",
-        confounded_with=("anchor_creep", "substrate", "tissue_yield", "attachments"),
+        confounded_with=("substrate", "tissue_yield", "attachments"),
         non_negative=True,
         history_dependent=True,
     ),

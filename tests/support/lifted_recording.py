@@ -12,9 +12,10 @@ from jiggle_mj.estimator.attribution.close_loop import Closed, close_the_loop
 from jiggle_mj.estimator.attribution.dataset import Dataset, collect_dataset
 from jiggle_mj.estimator.attribution.discrepancy import discrepancy
 from jiggle_mj.estimator.blas import one_thread
-from jiggle_mj.estimator.effects import LIBRARY
+from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.estimator.filters.evidence import Evidence
-from jiggle_mj.estimator.physics.environment import Weight
+from jiggle_mj.estimator.physics.energy import SheetEnergy
+from jiggle_mj.estimator.physics.environment import Tether, Weight
 from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
 from tests.support.small_sheet import (
     DECLARATION,
@@ -42,12 +43,20 @@ SMALL_LIBRARY = tuple(
 
 
 @cache
-def lifted(gravity: float) -> tuple[np.ndarray, ...]:
-    """Return the states of the shared lifts under a share of the declared gravity; what is held follows the tip."""
+def lifted(gravity: float, tethering: float = 0.0) -> tuple[np.ndarray, ...]:
+    """Return the states of the shared lifts; what is held follows the tip.
+
+    Args:
+        gravity: share of the declared gravity.
+        tethering: stiffness per area of springs that tie all of the sheet to its rest shape [N/m^3].
+    """
     kinds = [type(term) for term in sheet_energy().terms]
     energy = eqx.tree_at(
         lambda e: e.terms[kinds.index(Weight)].gravity, sheet_energy(), replace_fn=lambda g: gravity * g
     )
+    springs = tethering * jnp.asarray(sheet().particle_area)[:, None, None] * jnp.eye(3)[None]
+    tether = eqx.tree_at(lambda t: t.stiffness, Tether.build(sheet().rest), springs)
+    energy = SheetEnergy.build(np.asarray(energy.rest), (*energy.terms, tether), energy.layout)
     balance, k = sheet_balance(1e-4).with_energy(energy), DECLARATION.membrane_stiffness
     s, states = jnp.asarray(attached() * STIFFNESS / (STIFFNESS + k)), []
     first = {lift.grasp: lift.tip for lift in lifts()[::-1]}
@@ -61,10 +70,10 @@ def lifted(gravity: float) -> tuple[np.ndarray, ...]:
     return tuple(states)
 
 
-def observed(gravity: float, *, tool_scale: float = 1.0) -> list[Observation]:
+def observed(gravity: float, *, tool_scale: float = 1.0, tethering: float = 0.0) -> list[Observation]:
     """Return still frames, then the lifts: noisy tracked points, and the tool as it reports."""
     frames = [(sheet().rest, np.array([0.0, 0.0, 0.05]), 0)] * N_STILL
-    frames += [(x, lift.tip, lift.grasp) for x, lift in zip(lifted(gravity), lifts(), strict=True)]
+    frames += [(x, lift.tip, lift.grasp) for x, lift in zip(lifted(gravity, tethering), lifts(), strict=True)]
     first = {grasp: tip for _, tip, grasp in frames[::-1]}
     return [
         Observation(
@@ -87,11 +96,13 @@ def observed(gravity: float, *, tool_scale: float = 1.0) -> list[Observation]:
     ]
 
 
-def closed_over(observations: list[Observation]) -> tuple[Closed, dict, Dataset]:
+def closed_over(
+    observations: list[Observation], library: tuple[Effect, ...] = SMALL_LIBRARY
+) -> tuple[Closed, dict, Dataset]:
     """Close the loop over a recording, and return the result, the content of discrepancy.json and the dataset."""
     dataset = collect_dataset(DECLARATION, None, observations)
     with jax.enable_x64(True), one_thread():
-        closed = close_the_loop(dataset, library=SMALL_LIBRARY)
+        closed = close_the_loop(dataset, library=library)
         return closed, discrepancy(closed, dataset), dataset
 
 

@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 
+from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.eval.report.discrepancy_page import story
 from jiggle_mj.observation import Observation
-from tests.support.lifted_recording import NOISE, closed_over, observed, report_further
+from tests.support.lifted_recording import NOISE, SMALL_LIBRARY, closed_over, observed, report_further
 from tests.support.small_sheet import attached
 
 GRAVITY_ERROR = 0.05
 """Error of the fitted gravity [g], a sixteenth of the missing part."""
 SCALE_ERROR = 0.02
 """Error of the fitted scale of the tool [log factor], a fifth of the true one."""
+TETHERING, TETHERING_ERROR = 2e4, 0.1
+"""Stiffness of a hold on all of the sheet [N/m^3], and the relative error of the fitted one: the stretching stiffness,
+a nuisance parameter, is known to 5 %."""
 NOISE_RMS = 3**0.5 * NOISE
 """Root mean square length of the noise of three coordinates [m]."""
 
@@ -54,6 +58,16 @@ def test_a_tool_that_moves_further_than_it_reports_is_named():
     assert found["effects"][0]["name"] == "tool_scale", story(found)
     assert found["effects"][0]["theta"][0] == pytest.approx(np.log(1.1), abs=SCALE_ERROR)
     assert found["effects"][0]["this_session_alone"]
+
+
+@pytest.mark.slow
+def test_a_hold_on_all_of_the_sheet_is_no_attachment_of_every_particle():
+    """Attachments of all particles explain it as well, and are likelier one by one."""
+    tethering = next(effect for effect in LIBRARY if effect.name == "tethering")
+    closed, found, _ = closed_over(observed(1.0, tethering=TETHERING), (*SMALL_LIBRARY, tethering))
+    assert found["effects"][0]["name"] == "tethering", story(found)
+    assert found["effects"][0]["theta"][0] == pytest.approx(TETHERING, rel=TETHERING_ERROR)
+    assert np.sum(closed.final.attached != attached()) < 0.1 * np.sum(closed.contexts[0].fitted.attached != attached())
 
 
 @pytest.mark.slow
