@@ -54,9 +54,10 @@ def lifted(gravity: float, tethering: float = 0.0) -> tuple[np.ndarray, ...]:
     energy = eqx.tree_at(
         lambda e: e.terms[kinds.index(Weight)].gravity, sheet_energy(), replace_fn=lambda g: gravity * g
     )
-    springs = tethering * jnp.asarray(sheet().particle_area)[:, None, None] * jnp.eye(3)[None]
-    tether = eqx.tree_at(lambda t: t.stiffness, Tether.build(sheet().rest), springs)
-    energy = SheetEnergy.build(np.asarray(energy.rest), (*energy.terms, tether), energy.layout)
+    if tethering:
+        springs = tethering * jnp.asarray(sheet().particle_area)[:, None, None] * jnp.eye(3)[None]
+        tether = eqx.tree_at(lambda t: t.stiffness, Tether.build(sheet().rest), springs)
+        energy = SheetEnergy.build(np.asarray(energy.rest), (*energy.terms, tether), energy.layout)
     balance, k = sheet_balance(1e-4).with_energy(energy), DECLARATION.membrane_stiffness
     s, states = jnp.asarray(attached() * STIFFNESS / (STIFFNESS + k)), []
     first = {lift.grasp: lift.tip for lift in lifts()[::-1]}
