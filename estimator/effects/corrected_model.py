@@ -18,11 +18,12 @@ from .sheet_model import FrameContext, SheetModel, View, centred, nominal_energy
 
 PARTS = ("energy", "tool", "view")
 """Parts of a model that an effect may change."""
-PROBE_STRETCH = 1.01
-"""Factor by which the sheet is larger than at rest in the frame that shows what an effect changes."""
+PROBE_STRETCH = 1.5
+"""Factor by which the sheet is larger than at rest in the frame that shows what an effect changes: beyond every limit
+from which on something yields."""
 PROBE_TIMES = (1e6, 1e6 + 0.2, 1e6 + 0.3)
 """Times of the tool's reports in that frame, the last one its own [s]: later than any drift begins."""
-PROBE_DISPLACEMENTS = (0.0, 1e-3, 3e-3)
+PROBE_DISPLACEMENTS = (0.0, 0.03, 0.1)
 """Displacement along `PROBE_DIRECTION` that these report [m]."""
 PROBE_DIRECTION = (0.31, -0.55, 0.77)
 """Direction of the tool in that frame, along no axis of a rotation that anybody would give."""
