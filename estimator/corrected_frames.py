@@ -35,7 +35,7 @@ MAX_PASSES = 4
 CONVERGED = 1e-5
 """Largest change of a position between two passes with which a frame has converged [m]."""
 OPEN_PASSES = 3
-"""Passes that remove the view's errors from positions with open jaws: each multiplies what is left by the error."""
+"""Passes that remove the view's errors from positions with open jaws: each multiplies their error by the view's."""
 MIN_REPORTS = 8
 """Number of reports of the tool, and of states, that room is made for at least; it doubles when it is full."""
 
@@ -43,7 +43,7 @@ Fuse = Callable[[Track, GripHold, ToolState], FusedFrame]
 """Function that combines what is seen and what the tool reports in one frame."""
 
 
-def refuse_effects_not_carried(declaration: Declaration, config: EstimatorConfig) -> None:
+def refuse_unusable_effects(declaration: Declaration, config: EstimatorConfig) -> None:
     """Refuse declared effects that an estimate with these settings cannot have in its model.
 
     Raises:
@@ -92,7 +92,7 @@ class CorrectedFrames:
             state: of the filter before the frame.
             observation: the frame.
             track: what is seen of the particles, with the view's errors.
-            hold: the grasp, at positions with the view's errors.
+            hold: the grasp, with the view's errors in the positions that were observed.
             before: positions after the frame before, or at rest where the jaws have just closed [m].
             fuse: combines what is seen and what the tool reports.
 
@@ -202,7 +202,8 @@ class CorrectedFrames:
                 lambda c: (c.time, c.closed), context, (context.time - context.closed, jnp.zeros_like(context.closed))
             )
             closing = self.model.model(at_closing, model.tool)
-            hold = replace(hold, closed_at=np.asarray(without_view(closing, context.rest, jnp.asarray(hold.closed_at))))
+            corrected = np.asarray(without_view(closing, context.rest, jnp.asarray(hold.closed_at)))
+            hold = replace(hold, closed_at=np.where(hold.observed[:, None], corrected, hold.closed_at))
         displacement, shown = np.asarray(model.tool), hold.held & seen.visible
         if tool.by_points and shown.any():
             displacement = np.mean((seen.positions - hold.rotated(tool))[shown], axis=0)

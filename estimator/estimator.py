@@ -25,7 +25,7 @@ from .belief.attachment_belief import AttachmentBelief
 from .belief.topology import Change, region_of
 from .blas import one_thread
 from .config import EstimatorConfig
-from .corrected_frames import refuse_effects_not_carried
+from .corrected_frames import refuse_unusable_effects
 from .filters.force_balance import ForceBalance
 from .filters.kept_frames import kept_frames
 from .filters.posterior_summary import Convergence
@@ -68,7 +68,7 @@ class Estimator:
         """
         self.declaration = as_instance(declaration, "declaration", Declaration, hint="Declaration() has defaults.")
         self.config = config = as_instance(EstimatorConfig() if config is None else config, "config", EstimatorConfig)
-        refuse_effects_not_carried(declaration, config)
+        refuse_unusable_effects(declaration, config)
         self.skipped: list[tuple[int, str]] = []
         """Index and reason of each observation that could not be used."""
         self.cloud_shares: list[float] = []

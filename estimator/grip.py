@@ -28,6 +28,8 @@ class GripHold:
     """Which particles are held."""
     closed_at: Float[np.ndarray, "n 3"]
     """Positions of the particles when the jaws closed [m]."""
+    observed: Bool[np.ndarray, " n"]
+    """Which of these were observed; the others are those at rest."""
     tip: Float[np.ndarray, " 3"]
     """Position of the tip when the jaws closed [m]."""
     orientation: Rotation
@@ -40,9 +42,12 @@ class GripHold:
         positions: Float[np.ndarray, "n 3"],
         named: Bool[np.ndarray, " n"] | None,
         *,
+        observed: Bool[np.ndarray, " n"] | None = None,
         corrected: Float[np.ndarray, "n 3"] | None = None,
     ) -> "GripHold":
         """Close the jaws over particles at the given positions [m]; `named` particles replace those in the radius.
+
+        All positions are `observed` where nothing else is said.
 
         Where positions have known errors, the `corrected` ones say which are in the radius.
 
@@ -57,7 +62,14 @@ class GripHold:
                 f"{distance.min() * 1e3:.1f} mm from the nearest particle, and the jaws reach "
                 f"{tool.radius * 1e3:.1f} mm (check the tool pose, the camera pose, or the radius)."
             )
-        return cls(grasp=tool.grasp, held=held, closed_at=positions, tip=tool.position, orientation=_orientation(tool))
+        return cls(
+            grasp=tool.grasp,
+            held=held,
+            closed_at=positions,
+            observed=np.ones(len(positions), bool) if observed is None else observed,
+            tip=tool.position,
+            orientation=_orientation(tool),
+        )
 
     def rotated(self, tool: ToolState) -> Float[np.ndarray, "n 3"]:
         """Return where the particles would be had they only rotated with the tool, about the tip, since closing [m]."""
@@ -118,7 +130,7 @@ class GripTracker:
         if corrected is not None:
             corrected = np.where(seen[:, None], corrected, rest)
         try:
-            return GripHold.close(self.closing, at_closing, named, corrected=corrected), rest
+            return GripHold.close(self.closing, at_closing, named, observed=seen, corrected=corrected), rest
         except PerceptionError:
             self.closing = None  # a later frame of this grasp may know better
             raise

@@ -1,5 +1,6 @@
 """Settings of nested, frozen dataclasses from names and values, as a TOML file or the command line gives them."""
 
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from types import UnionType
@@ -9,6 +10,8 @@ from .errors import MAX_SHOWN, OptionError
 from .likely_name import likeliest
 
 T = TypeVar("T")
+MAX_DEPTH = 8
+"""Tables inside one another that are read; settings are inside at most three."""
 
 
 def with_settings(config: T, table: Mapping[str, Any], *, where: str) -> T:
@@ -54,7 +57,13 @@ def nested(assignments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted name and the value of each entry of a table, those of its tables included."""
+    """Yield the dotted name and the value of each entry of a table, those of its tables included.
+
+    Raises:
+        OptionError: a table is inside more tables than any setting is.
+    """
+    if prefix.count(".") > MAX_DEPTH:
+        raise OptionError(f"{prefix[:MAX_SHOWN]}... is inside more than {MAX_DEPTH} tables; no setting is.")
     for name, value in table.items():
         if isinstance(value, Mapping):
             yield from leaves(value, f"{prefix}{name}.")
@@ -116,7 +125,7 @@ def _typed(value: Any, kind: Any, where: str) -> Any:
             return tuple(_typed(item, each, where) for item, each in zip(value, items, strict=True))
         allowed = f"{len(items)} values"
     elif kind is float:
-        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < float("inf"):
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max:
             return float(value)
         allowed = "a finite number"
     elif kind is int:

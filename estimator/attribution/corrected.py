@@ -31,7 +31,7 @@ def corrected_parameters(closed: Closed, declaration: Declaration) -> dict[str, 
     """Return the effects that were added, by the name that a declaration gives them."""
     found: dict[str, CorrectedParameter] = {}
     for one in closed.accepted:
-        effect, reach = one.effect, MAX_EFFECT * np.asarray(one.effect.prior_sd)
+        effect, reach = one.effect, MAX_EFFECT * np.asarray(one.effect.prior_sds[one.score.site])
         name = effect.name if effect.sites == 1 else f"{effect.name}.{one.score.site}"
         nominal = np.asarray(declaration.effects.get(name, np.zeros(len(effect.prior_sd))))
         lowest = nominal - reach

@@ -124,7 +124,7 @@ def _site(effect: Effect, text: str, where: str) -> int:
         return 0
     if effect.sites == 1:
         raise OptionError(f"{where}: {effect.name} has no sites; write {effect.name}.")
-    if not (text.isascii() and text.isdigit() and int(text) < effect.sites):
+    if text not in map(str, range(effect.sites)):
         raise OptionError(
             f"{where}: {effect.name} is at one of {effect.sites} sites; write {effect.name}.SITE with a number from 0 "
             f"to {effect.sites - 1}."

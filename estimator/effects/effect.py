@@ -42,7 +42,7 @@ class Effect:
     """
 
     name: str
-    """Name in reports: letters, digits and underscores."""
+    """Name in reports and files: ASCII letters, digits and underscores."""
     acts: Acts
     """Function that adds the effect to a frame's model."""
     units: tuple[str, ...]
@@ -74,8 +74,8 @@ class Effect:
 
     def __post_init__(self) -> None:
         """Check what a user may have given."""
-        if not self.name.replace("_", "").isalnum():
-            raise ValueError(f"Effect.name must be of letters, digits and underscores; got {self.name!r}.")
+        if not (self.name.isascii() and self.name.replace("_", "").isalnum()):
+            raise ValueError(f"Effect.name must be of ASCII letters, digits and underscores; got {self.name!r}.")
         if len(self.units) != len(self.prior_sd) or not self.prior_sd:
             raise ValueError(
                 f"Effect {self.name}: units and prior_sd need one entry for each parameter; got {len(self.units)} and "

@@ -33,8 +33,8 @@ def _attachment_loads(model: SheetModel, context: FrameContext) -> Float[Array, 
     position, it is the jaws that balance them.
     """
     load = -model.energy.internal_gradient(context.now)
-    carried = jnp.sum(load * (context.now - context.rest), axis=1) > 0
-    return jax.lax.stop_gradient(jnp.where(carried[:, None], load, 0.0))
+    outward = jnp.sum(load * (context.now - context.rest), axis=1) > 0
+    return jax.lax.stop_gradient(jnp.where(outward[:, None], load, 0.0))
 
 
 def _half_space(rest: Float[Array, "n 3"], load: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

@@ -14,7 +14,7 @@ SMALL_ANGLE = 1e-3
 BEGAN_SD = 2.0
 """Prior standard deviation of the time at which a drift begins, from the time of the rest shape [s]."""
 DRIFT_RATES = (1e-3, 1e-4, 1e-5)
-"""Prior standard deviations of the speed of a drift, of which one holds [m/s]: alike likely on a logarithmic scale."""
+"""Prior standard deviations of the speed of a drift, of which one holds, in equal steps of the logarithm [m/s]."""
 DRIFT_ARM = 0.1
 """Distance at which a drift's rotation moves a point as fast as its shift does [m]: a camera's from the sheet."""
 EDGE = 1e-6

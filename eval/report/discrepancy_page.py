@@ -59,7 +59,8 @@ def story(found: Mapping[str, Any]) -> list[str]:
             sentences.append(f"These frames do not distinguish {effect['name']} from: {', '.join(rivals)}.")
     sentences += [f"Refused: {effect['name']}, because {effect['why']}." for effect in found["refused"]]
     if found["effects"]:
-        sentences.append("The model with it is in corrected.toml; estimate --declare corrected.toml uses it.")
+        uses = "" if found["attachments"]["why"] else "; estimate --declare corrected.toml uses it"
+        sentences.append(f"The model with it is in corrected.toml{uses}.")
         sentences.append(_attachments_sentence(found))
     sentences += _held_out_sentences(found)
     if found["suggestion"] is not None:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from jiggle_mj.errors import OptionError
+from jiggle_mj.errors import OptionError, PerceptionError
 from jiggle_mj.estimate import Detection
 from jiggle_mj.estimator import Estimator, EstimatorConfig
 from jiggle_mj.estimator.perception import FrameMask, TissueMask
@@ -30,7 +30,7 @@ def corrected_detection(
         estimator = Estimator(corrected, recording.camera, config=config, mask=mask)
         for observation in recording:
             estimator.update(replace(observation, force=None))
-    except OptionError as refusal:
+        estimator.release()
+        return estimator.detection
+    except (OptionError, PerceptionError) as refusal:
         return str(refusal)
-    estimator.release()
-    return estimator.detection

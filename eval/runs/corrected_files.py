@@ -27,7 +27,9 @@ def write_corrected(
     corrected = corrected_declaration(added, declaration)
     effects = {effect.name: effect for effect in (*LIBRARY, *(one.effect for one in added.values()))}
     notes = {key: _note(effects[key.partition(".")[0]]) for key in corrected.effects}
-    about = [f"What is declared of {name}, with the effects of docs/EFFECTS.md that close-loop has added."]
+    about = [
+        f"What is declared of {' '.join(name.split())}, with the effects of docs/EFFECTS.md that close-loop has added."
+    ]
     about.append(f"jiggle-mj estimate RECORDING --declare {CORRECTED} estimates with it.")
     write_text(directory / CORRECTED, declaration_text(corrected, about=about, notes=notes))
     write_text(directory / PARAMETERS, parameters_text(added))

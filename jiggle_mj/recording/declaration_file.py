@@ -5,6 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from ..argument_checks import as_path
 from ..errors import OptionError
 from ..nested_settings import with_settings
 from ..observation import MATERIAL_BOUNDS, Declaration
@@ -14,12 +15,13 @@ UNITS = {name: unit for name, (unit, _) in MATERIAL_BOUNDS.items()} | {"gravity"
 """Unit of each property that has one."""
 
 
-def read_declaration(path: Path) -> dict[str, Any]:
+def read_declaration(path: str | Path) -> dict[str, Any]:
     """Return the properties that a file declares, by name, as `declare` of `run_estimator` and others takes them.
 
     Raises:
         OptionError: it cannot be read, or holds an unknown name or a value that a declaration refuses.
     """
+    path = as_path(path, "declare")
     return checked_properties(read_table(path, "declare"), where=f"declare {path}")
 
 

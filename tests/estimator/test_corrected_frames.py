@@ -79,6 +79,14 @@ def test_a_camera_that_is_declared_moved_is_as_good_as_one_that_stayed(flawless)
         assert abs(of(found) - expected) < REMAINING * abs(of(without) - expected), of
 
 
+def test_what_the_jaws_hide_of_a_moved_view_is_taken_from_rest():
+    """Nothing is seen of what is held, as in images; where it was at rest has no error of the view."""
+    flawless, states = followed(_with_held_points_hidden(observed(1.0)))
+    estimator, found = followed(moved_camera(_with_held_points_hidden(observed(1.0))), camera_bias=CAMERA)
+    np.testing.assert_array_equal(estimator.detection.attached, flawless.detection.attached)
+    assert np.sqrt(np.mean((found - states) ** 2)) < NOISE
+
+
 def test_a_tool_that_is_declared_to_go_further_is_as_good_as_one_that_reports_right(flawless):
     estimator, states = followed(observed(1.0, tool_scale=1.1), tool_scale=(float(np.log(1.1)),))
     np.testing.assert_allclose(states, flawless[1], rtol=0, atol=SAME)
@@ -157,6 +165,20 @@ def test_open_positions_are_without_the_errors_of_the_view():
     np.testing.assert_allclose(estimator.positions, flawless.positions, rtol=0, atol=NOISE)
     undeclared, _ = followed(seen)
     assert np.abs(undeclared.positions - flawless.positions).max() > 10 * NOISE
+
+
+def _with_held_points_hidden(observations: list[Observation]) -> list[Observation]:
+    """Return the recording without the points within the jaws' radius where they closed."""
+    rest, hidden, grasp, seen = sheet().rest, np.zeros(sheet().n, bool), -1, []
+    for one in observations:
+        assert one.points is not None
+        if one.tool.closed and one.tool.grasp != grasp:
+            grasp = one.tool.grasp
+            hidden = np.linalg.norm(rest - one.tool.position, axis=1) <= one.tool.radius
+        covered = one.tool.closed & hidden
+        at = np.where(covered[:, None], np.nan, one.points.positions)
+        seen.append(dataclasses.replace(one, points=dataclasses.replace(one.points, positions=at)))
+    return seen
 
 
 def _opened(observation: Observation) -> Observation:

@@ -1,5 +1,7 @@
 """Settings by dotted names: typed by their field, and an unknown name gets the one that was probably meant."""
 
+from pathlib import Path
+
 import pytest
 
 from jiggle_mj.cli.settings import configured, declared
@@ -49,6 +51,17 @@ def test_a_wrong_declaration_or_file_is_refused_by_name(tmp_path):
         declared(("poisson=0.7",))
     with pytest.raises(OptionError, match="cannot be read"):
         configured(tmp_path / "none.toml", (), "implicit")
+    with pytest.raises(OptionError, match="is inside more than 8 tables"):
+        declared((deep_file(tmp_path),))
+    with pytest.raises(OptionError, match="must be a finite number"):
+        declared((f"poisson={10**400}",))
     (tmp_path / "bad.toml").write_text("= 1")
     with pytest.raises(OptionError, match="is no TOML"):
         configured(tmp_path / "bad.toml", (), "implicit")
+
+
+def deep_file(folder: Path) -> str:
+    """Return the path of a file with a table inside many others."""
+    path = folder / "deep.toml"
+    path.write_text(f"[{'.'.join('a' * 3000)}]\nb = 1\n")
+    return str(path)

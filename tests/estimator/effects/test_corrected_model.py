@@ -42,6 +42,8 @@ def usual(name: str) -> tuple[str, tuple[float, ...]]:
         ({"friction": (-0.1,)}, "friction must not be negative"),
         ({"inclusion": (1.0,)}, "inclusion is at one of 36 sites; write inclusion.SITE with a number from 0 to 35"),
         ({"inclusion.36": (1.0,)}, "with a number from 0 to 35"),
+        ({"inclusion.014": (1.0,)}, "with a number from 0 to 35"),
+        ({f"inclusion.{'9' * 5000}": (1.0,)}, "with a number from 0 to 35"),
         ({"friction.0": (0.1,)}, "friction has no sites; write friction"),
         ({"swing": (1.0, 1.0)}, "applies only to a sheet with weight and no bed"),
         ({"tool_latency": (0.1,)}, "tool_latency needs what the tool reports after each frame"),
