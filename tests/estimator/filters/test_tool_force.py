@@ -10,7 +10,7 @@ import pytest
 
 from jiggle_mj.actions import Cut
 from jiggle_mj.estimate import Sheet
-from jiggle_mj.estimator import summaries
+from jiggle_mj.estimator import EstimatorConfig, summaries
 from jiggle_mj.estimator.belief.topology import region_of
 from jiggle_mj.estimator.filters.config import FilterConfig
 from jiggle_mj.estimator.filters.evidence import Evidence, MeasuredPull
@@ -303,7 +303,17 @@ def tracked() -> TrackedSheet:
     state, *_ = follow(filter, first, seen)
     rest, field = sheet().rest, MeshField(sheet().rest[:, :2], sheet().faces)
     parts = Sheet(rest=rest, faces=sheet().faces)
-    return TrackedSheet(sheet=parts, filter=filter, field=field, prior_entropy=0.0, state=state, x=rest, open_x=rest)
+    return TrackedSheet(
+        sheet=parts,
+        filter=filter,
+        field=field,
+        grip_sd=EstimatorConfig().grip_sd,
+        prior_entropy=0.0,
+        state=state,
+        x=rest,
+        open_x=rest,
+        corrected=None,
+    )
 
 
 def test_between_releases_the_factor_is_that_of_the_present_belief(tracked):
