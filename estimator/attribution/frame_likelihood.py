@@ -81,10 +81,14 @@ class FrameLikelihood(eqx.Module):
 
         It is ln |N + H F F^T H^T| - 2 ln |H|. Rows without a force equation are those of inputs, and do not count.
         """
+        return self.force_log_determinant() - self._log_det_of_square()
+
+    def force_log_determinant(self) -> Float[Array, ""]:
+        """Return ln |N + H F F^T H^T|, up to the same: all that changes with the variances at a given H."""
         w, known = self.frame.weight, self.frame.weight > 0
         log_weights = jnp.sum(jnp.where(known, 3 * jnp.log(jnp.where(known, w, 1.0)), 0.0))
         smooth = 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
-        return log_det(self.frame.factor) - log_weights + smooth - self._log_det_of_square()
+        return log_det(self.frame.factor) - log_weights + smooth
 
     def _log_det_of_square(self) -> Float[Array, ""]:
         """Return ln |H^T H| over the particles with a force equation."""
