@@ -21,7 +21,7 @@ from jiggle_mj.observation import Declaration, Observation, ToolReport, ToolStat
 from .config import EstimatorConfig
 from .effects import LIBRARY
 from .effects.corrected_model import CorrectedModel, declared_effects, resting
-from .effects.frame_history import FrameHistory, FrameRecord, padded
+from .effects.frame_history import CONVERGED, MAX_PREDICTIONS, FrameHistory, FrameRecord, padded
 from .effects.sheet_model import FrameContext, SheetModel, look, without_view
 from .filters.evidence import Evidence
 from .filters.filter import Filter, FilterState
@@ -30,10 +30,6 @@ from .fusion import FusedFrame
 from .grip import GripHold
 from .perception.track import Track
 
-MAX_PASSES = 4
-"""Most passes over one frame."""
-CONVERGED = 1e-5
-"""Largest change of a position between two passes with which a frame has converged [m]."""
 OPEN_PASSES = 3
 """Passes that remove the view's errors from positions with open jaws: each multiplies their error by the view's."""
 MIN_REPORTS = 8
@@ -111,7 +107,7 @@ class CorrectedFrames:
 
         frame, x = fused(before), before
         after, update = filter.update(state, frame.evidence, jnp.asarray(frame.start))
-        for _ in range(MAX_PASSES - 1):
+        for _ in range(MAX_PREDICTIONS - 1):
             moved, x = np.abs(np.asarray(update.x) - x).max(), np.asarray(update.x)
             if (
                 not update.explains_the_frame

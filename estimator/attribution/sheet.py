@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..effects.effect import Effect, with_effects
-from ..effects.frame_history import FrameHistory
+from ..effects.frame_history import CONVERGED, MAX_PREDICTIONS, FrameHistory
 from ..effects.sheet_model import FrameContext, SheetModel, View, look, without_view
 from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
@@ -17,10 +17,6 @@ from .grasped_frames import ClosedFrame, Timed
 
 GRIP_PRECISION = 1e6
 """Precision of the held particles' positions while a state is predicted [1/m^2]."""
-MAX_PREDICTIONS = 4
-"""Largest number of predictions of a frame with a history-dependent effect, each from the state of the one before."""
-CONVERGED = 1e-5
-"""Largest change of a position [m] with which such a frame has converged."""
 
 
 class PredictedSheet(eqx.Module):

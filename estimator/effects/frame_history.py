@@ -13,6 +13,10 @@ from .sheet_model import FrameContext
 
 USUAL_GAP = 0.25
 """Time between frames that is assumed before the first frame of a grasp [s]."""
+MAX_PREDICTIONS = 4
+"""Most computations of a frame's state where an effect depends on it, each from the state of the one before."""
+CONVERGED = 1e-5
+"""Largest change of a position [m] with which such a frame has converged."""
 
 
 @dataclass(frozen=True, kw_only=True)
