@@ -7,13 +7,11 @@ on scene, sensing and seed alone, not on the executor or the number of its worke
 
 import shutil
 import tempfile
-from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from queue import SimpleQueue
 
 from mcap.records import Metadata
 
@@ -21,20 +19,16 @@ from jiggle_mj.options import SENSING, Sensing
 from jiggle_mj.scenes import Reference, Scene, programme
 
 from .argument_checks import as_choice, as_instance, as_integer, as_path, quoted
-from .cluster import died_with_its_worker
 from .episode import check_directory, clear_directory, observe, recording_identity
 from .errors import OptionError, OutputError, RecordingError, SimulationError
 from .recording.declaration import METADATA
 from .recording.mcap_files import iterate_records, truth_path
 from .recording.truth import salt
+from .run_each import run_each
 from .worker_processes import WorkerProcesses
 
 MAX_RECORDINGS = 100_000
 """Most recordings of one series: of some MB each they fill a disk."""
-TRIES = 3
-"""How many workers may die at a recording before it is given up."""
-CANCELLED = "its executor cancelled it, because it was stopped or lost its scheduler"
-"""Reason for a recording that its executor cancelled."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +71,8 @@ def record_series(
 ) -> RecordingSeries:
     """Record a scene with the seeds `seed` to `seed + count - 1`, except those that are complete in the folder.
 
-    Files are named by their seed: 000007.mcap and 000007.truth.mcap. A recording whose worker dies is restarted until
-    `TRIES` workers have died; one whose simulation fails leaves its state in 000007.failed. The others continue.
+    Files are named by their seed: 000007.mcap and 000007.truth.mcap. A recording whose worker dies is restarted, up to
+    `run_each.TRIES` times in all; one whose simulation fails leaves its state in 000007.failed. The others continue.
 
     Args:
         scene: the scene to record.
@@ -128,54 +122,19 @@ def record_series(
     with ExitStack() as stack:
         if executor is None:
             executor = stack.enter_context(WorkerProcesses())
-        failed = _execute(missing, executor, on_done)
+        failed = run_each(
+            _record,
+            {order.seed: order for order in missing},
+            executor,
+            on_done=lambda done, why: on_done(done) if why is None else None,
+            fails_alone=lambda failure: isinstance(failure, SimulationError),
+        )
     return RecordingSeries(
         folder=folder,
         recordings=tuple(folder / order.path.name for order in orders if order.seed not in failed),
         n_kept=len(kept),
         failed=dict(sorted(failed.items())),
     )
-
-
-def _execute(orders: list[_Order], executor: Executor, on_done: Callable[[int], None]) -> dict[int, str]:
-    """Execute the orders; return the reason by seed for those that failed."""
-    finished: SimpleQueue[Future[None]] = SimpleQueue()
-    pending: dict[Future[None], _Order] = {}
-    deaths: Counter[int] = Counter()
-    failed: dict[int, str] = {}
-
-    def submit(order: _Order) -> None:
-        try:
-            future = executor.submit(_record, order)
-        except BrokenExecutor as failure:
-            future = Future()
-            future.set_exception(failure)
-        pending[future] = order
-        future.add_done_callback(finished.put)
-
-    try:
-        for order in orders:
-            submit(order)
-        while pending:
-            future = finished.get()
-            order = pending.pop(future)
-            failure = CancelledError(CANCELLED) if future.cancelled() else future.exception()
-            if failure is None:
-                on_done(order.seed)
-            elif isinstance(failure, BrokenExecutor):
-                deaths[order.seed] += 1
-                if deaths[order.seed] < TRIES:
-                    submit(order)
-                else:
-                    failed[order.seed] = f"its worker died or could not be started {TRIES} times: {failure}."
-            elif isinstance(failure, SimulationError | CancelledError) or died_with_its_worker(failure):
-                failed[order.seed] = str(failure)
-            else:
-                raise failure
-    finally:
-        for future in pending:
-            future.cancel()
-    return failed
 
 
 def _record(order: _Order) -> None:

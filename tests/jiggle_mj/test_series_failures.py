@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from jiggle_mj.errors import RenderError, SceneError, SimulationError
+from jiggle_mj.run_each import TRIES
 from jiggle_mj.scenes import Reference, disturbed
-from jiggle_mj.series import TRIES
 from jiggle_mj.worker_processes import WorkerProcesses
 from tests.support.series import (
     COUNT,
