@@ -15,7 +15,7 @@ from .terminal import FAILED, console, log
 
 
 def bench(
-    part: Annotated[Literal["estimator", "plan", "reference"], tyro.conf.Positional] = "estimator",
+    part: Annotated[Literal["estimator", "plan", "close-loop", "reference"], tyro.conf.Positional] = "estimator",
     /,
     *,
     sizes: tuple[int, ...] | None = None,
@@ -23,15 +23,16 @@ def bench(
     gate: bool = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the speed of the estimator, of a plan or of the reference tissue on this machine.
+    """Measure the speed of the estimator, of a plan, of closing the loop or of the reference tissue on this machine.
 
     Prints the median time of each part; compile time is separate.
 
     Args:
-        part: what to time: the estimator, a plan of the policy 'information', or the reference tissue.
+        part: what to time: the estimator, a plan of the policy 'information', closing the loop over a recording (which
+            takes many minutes), or the reference tissue.
         sizes: approximate numbers of particles (default 600 1200; the first is also run with the paper's filter, and
-            above 10000 only the solver is timed; for a plan 600), or of the reference's vertices (default 300 625 1200
-            2500).
+            above 10000 only the solver is timed; for a plan and for closing the loop 600), or of the reference's
+            vertices (default 300 625 1200 2500).
         paper: time the paper's filter and controller too, which takes minutes on a CPU.
         gate: exit with 1 where a figure is worse than the committed baseline allows.
         as_json: print the figures to stdout as JSON.
@@ -42,6 +43,10 @@ def bench(
         from jiggle_mj.eval.benchmark import reference_benchmark as reference
 
         metrics = reference.reference_benchmark(sizes or reference.SIZES, log=log)
+    elif part == "close-loop":
+        from jiggle_mj.eval.benchmark import close_loop_benchmark as closing
+
+        metrics = closing.close_loop_benchmark(sizes or closing.SIZES, log=log)
     elif part == "plan":
         from jiggle_mj.eval.benchmark import plan_benchmark as plan
 

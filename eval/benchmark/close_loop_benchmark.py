@@ -1,0 +1,154 @@
+"""Time of closing the loop, part by part: over a recording with nothing undeclared, and over one with one effect.
+
+The reference tissue `arc` is lifted at its four corners, eight increments each, and its particles are seen with noise.
+Every part is called twice in one process; what the first call takes longer is compiling. What is logged while the whole
+runs for the second time is printed with its seconds, so that it is seen where the time goes.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from jiggle_mj.episode import observe
+from jiggle_mj.estimator.attribution.close_loop import Closed, close_the_loop
+from jiggle_mj.estimator.attribution.dataset import Dataset, collect_dataset
+from jiggle_mj.estimator.attribution.fit import fit
+from jiggle_mj.estimator.attribution.held_out import predict_held_out
+from jiggle_mj.estimator.attribution.problem import Problem
+from jiggle_mj.estimator.attribution.remainder import remainder_of_fit
+from jiggle_mj.estimator.attribution.scores import scores
+from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.effects import LIBRARY, Effect
+from jiggle_mj.recording.reader import Recording
+from jiggle_mj.scenes import Reference, Scene, disturbed, programme
+from jiggle_mj.worker_processes import usable_cores
+
+from .estimator_benchmark import Metrics, peak_memory, timed
+from .reference_benchmark import sized
+
+SIZES = (600,)
+"""About how many particles the sheet has."""
+EFFECT = "stretch"
+"""Effect of the second recording, which nobody declares to the estimator."""
+CASES = {"nothing": (), "effect": (f"{EFFECT}=2.5",)}
+"""Disturbances of each recording; the sheet is 2.5 times as stiff as declared."""
+STILL_FRAMES = 20
+"""Frames before the first grasp, from which the noise is measured."""
+BED_FRICTION = 0.1
+"""Coefficient of friction of the bed, with which closing the loop counts in any sheet; the shipped scene has 0.3."""
+REPEATS = 1
+"""Calls after the first one: the whole takes minutes."""
+
+
+@dataclass(kw_only=True)
+class PhaseClock:
+    """Receives log lines, and keeps the seconds from each to the next; use the instance as the log."""
+
+    phases: list[tuple[float, str]] = field(default_factory=list)
+    """Seconds before each line, and the line."""
+    began: float = field(default_factory=time.perf_counter)
+    """When the last line came [s]."""
+
+    def __call__(self, line: str) -> None:
+        """Keep a line."""
+        now = time.perf_counter()
+        self.phases.append((now - self.began, line))
+        self.began = now
+
+    def restart(self) -> None:
+        """Forget all lines, and start anew."""
+        self.phases, self.began = [], time.perf_counter()
+
+
+def close_loop_benchmark(
+    sizes: tuple[int, ...],
+    *,
+    log: Callable[[str], None],
+    scene: Callable[[int], Scene] = sized,
+    library: tuple[Effect, ...] = LIBRARY,
+) -> Metrics:
+    """Time closing the loop at each size.
+
+    Args:
+        sizes: particles, about.
+        log: gets a line before each part, and the lines of closing the loop with their seconds.
+        scene: returns a scene of about so many particles.
+        library: effects that are looked for; `EFFECT` must be among them.
+    """
+    with jax.enable_x64(True), one_thread():
+        metrics: Metrics = {
+            "device": {"value": jax.devices()[0].device_kind, "unit": "name"},
+            "precision": {"value": str(jnp.zeros(()).dtype), "unit": "name"},
+            "cores": {"value": usable_cores(), "unit": "count"},
+        }
+        for n in sizes:
+            for case, disturbances in CASES.items():
+                log(f"n = {n}, {case} undeclared: recording")
+                with tempfile.TemporaryDirectory() as folder:
+                    recording = _recorded(disturbed(plain(scene(n)), disturbances), Path(folder) / "run.mcap")
+                    found = _times(recording, library, log)
+                metrics |= {f"close_loop_{case}_n{n}_{name}": entry for name, entry in found.items()}
+    metrics["peak_memory"] = {"value": peak_memory(), "unit": "GiB"}
+    return metrics
+
+
+def plain(scene: Scene) -> Scene:
+    """Return the scene with still frames, and with no more friction than any sheet may have."""
+    still = replace(scene.programme, still_frames=STILL_FRAMES)
+    return replace(scene, programme=still, bed=replace(scene.bed, friction=BED_FRICTION))
+
+
+def _recorded(scene: Scene, path: Path) -> Recording:
+    with Reference(scene, seed=0, sensing="particles") as reference:
+        for _ in observe(reference, programme(scene), path, seed=0):
+            pass
+    return Recording.open(path)
+
+
+def _times(recording: Recording, library: tuple[Effect, ...], log: Callable[[str], None]) -> Metrics:
+    """Return the seconds of all parts for one recording, and what was found in it."""
+    metrics: Metrics = {}
+
+    def measure(name: str, call: Callable[[], object]) -> None:
+        log(f"  {name}")
+        compiled, seconds = timed(call, repeats=REPEATS)
+        metrics[f"{name}_s"] = {"value": seconds, "unit": "s"}
+        metrics[f"{name}_compile_s"] = {"value": compiled, "unit": "s"}
+
+    datasets, closings, clock = list[Dataset](), list[Closed](), PhaseClock()
+
+    def read() -> None:
+        datasets.append(collect_dataset(recording.declaration, recording.camera, recording))
+
+    def close() -> None:
+        clock.restart()
+        closings.append(close_the_loop(datasets[-1], library=library, log=clock))
+        clock("end")
+
+    measure("read_and_filter", read)
+    measure("build", lambda: Problem.build(datasets[-1], library))
+    measure("close", close)
+    for seconds, line in clock.phases:
+        log(f"    {seconds:7.2f} s until: {line}")
+    closed = closings[-1]
+    problem, fitted = closed.problem, closed.contexts[0].fitted
+    parts = list(dict.fromkeys(timed_frame.part for timed_frame in datasets[-1].frames))
+    measure("scores", lambda: scores(problem, fitted))
+    measure("one_hypothesis", partial(fit, problem, problem.sheet.place(EFFECT), fitted.point, set(parts[:-1])))
+    measure("held_out", lambda: predict_held_out(problem, fitted, parts[-1]))
+    measure("remainder", lambda: remainder_of_fit(problem, fitted))
+    whole = float(metrics["read_and_filter_s"]["value"]) + float(metrics["close_s"]["value"])
+    named = ", ".join(one.effect.name for one in closed.accepted)
+    return {
+        "particles": {"value": len(datasets[-1].estimator.sheet.rest), "unit": "count"},
+        "frames": {"value": len(datasets[-1].frames), "unit": "count"},
+        "verdict": {"value": closed.verdict + (f": {named}" if named else ""), "unit": "name"},
+        "whole_s": {"value": whole, "unit": "s"},
+        **metrics,
+    }
