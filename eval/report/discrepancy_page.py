@@ -1,6 +1,6 @@
 """The result of closing the loop as one page that needs no network: sentences first, then pictures."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -125,6 +125,11 @@ def _suggestion_sentence(suggestion: Mapping[str, Any]) -> str:
         f"To distinguish {between}: grasp at {grasp} mm, pull by {pull} mm, and hold for {suggestion['hold_s']:.0f} s; "
         f"the expected log Bayes factor is {expected}."
     )
+
+
+def sizes_with_sd(values: Sequence[float], sds: Sequence[float], units: Sequence[str]) -> str:
+    """Return parameters and their standard deviations as text."""
+    return ", ".join(_size(*each) for each in zip(values, sds, units, strict=True))
 
 
 def _size(value: float, sd: float, unit: str) -> str:

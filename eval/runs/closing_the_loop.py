@@ -42,6 +42,8 @@ from .corrected_files import CORRECTED, PARAMETERS, write_corrected
 from .settings_used import settings_used, with_declared
 
 DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
+OWN_FILES = (DISCREPANCY, PAGE, CORRECTED, PARAMETERS)
+"""Files of a closed loop."""
 
 
 @fills_folder
@@ -89,11 +91,10 @@ def close_loop(
     """
     recording_path, directory = as_path(recording_path, "the recording"), as_path(directory, "the folder")
     recording = Recording.open(recording_path, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
-    own = (DISCREPANCY, PAGE, CORRECTED, PARAMETERS)
-    check_directory(directory, own, overwrite=overwrite)
+    check_directory(directory, OWN_FILES, overwrite=overwrite)
     declaration = with_declared(recording.declaration, declare)
     check_before(recording, recording_path, declare, allow_implausible=allow_implausible, log=log)
-    clear_directory(directory, own)
+    clear_directory(directory, OWN_FILES)
     dataset = collect_dataset(declaration, recording.camera, recording, config=config, mask=mask, on_frame=on_frame)
     used = settings_used(declaration, dataset.estimator.config, declare=declare, declared=recording.declared)
     with jax.enable_x64(True), one_thread():

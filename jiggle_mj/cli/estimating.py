@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import OptionError, RecordingError
 from ..options import FilterName, PolicyName, Sensing
+from .closing_many import close_several
 from .material import material_json, show_material
 from .options import (
     AS_DECLARED,
@@ -18,14 +19,17 @@ from .options import (
     Out,
     Parameters,
     PathArgument,
+    PathArguments,
     RecordingOptions,
     RecordingSettings,
+    SchedulerUrl,
     Settings,
     in_ns,
 )
 from .settings import configured, declared
 from .survey import doubt
 from .terminal import INTERRUPTED, console, deferred_interrupt, log, progress, show, stop
+from .workers import workers
 
 if TYPE_CHECKING:
     from jiggle_mj.estimator import Estimator
@@ -189,10 +193,12 @@ def identify(
 
 
 def close_loop(
-    recording: PathArgument,
+    recordings: PathArguments,
     /,
     *,
     out: Out,
+    jobs: int | None = None,
+    executor: SchedulerUrl = None,
     truth: Path | None = None,
     suggest: bool = False,
     settings: RecordingSettings = AS_RECORDED,
@@ -202,17 +208,24 @@ def close_loop(
 ) -> None:
     """Find which physical effect the model lacks for a recording, refit with it, and report the error before and after.
 
+    Of several recordings of one sheet, the effects and the errors are compared.
+
     Args:
-        recording: an MCAP file of observations.
-        out: folder for discrepancy.json, discrepancy.html, corrected.toml and parameters.yaml.
+        recordings: MCAP files of observations; truth files beside their recordings are left out.
+        out: folder for discrepancy.json, discrepancy.html, corrected.toml and parameters.yaml. Of several recordings,
+            a folder of its name holds these of each; complete ones are kept. report.html and results.json compare.
+        jobs: number of recordings at a time; the number of usable cores if left out. Like --executor it makes even a
+            single recording one of several.
+        executor: Dask scheduler whose workers do it instead; all of them share the recordings and the folder.
         truth: a truth file, to score the detected attachments before and after; it is read after the verdict.
         suggest: where several effects explain the frames, search the next pull that discriminates between them.
         settings: what is declared of the tissue, how the estimator is set, and which pixels are tissue.
         allow_truncated: use the complete frames of a recording that was cut off.
         overwrite: replace the results in the folder.
-        as_json: print discrepancy.json to stdout.
+        as_json: print discrepancy.json to stdout, or results.json of several recordings.
     """
     from jiggle_mj.eval.report.discrepancy_page import story
+    from jiggle_mj.eval.runs.closing_many import without_truth
     from jiggle_mj.eval.runs.closing_the_loop import PAGE
     from jiggle_mj.eval.runs.closing_the_loop import close_loop as close
     from jiggle_mj.eval.runs.mask_files import mask_shown
@@ -220,7 +233,26 @@ def close_loop(
     from ..recording.reader import Recording
 
     config, declare = configured(settings.config, settings.set, "implicit"), declared(settings.declare)
-    tolerance_ns = in_ns(settings.pairing_tolerance)
+    tolerance_ns, given = in_ns(settings.pairing_tolerance), without_truth(recordings)
+    if len(given) != 1 or jobs is not None or executor is not None:
+        if truth is not None:
+            raise OptionError(f"--truth {truth}: it is of one recording; leave it out, or give that recording alone.")
+        close_several(
+            given,
+            out,
+            workers(jobs, executor),
+            as_json=as_json,
+            suggestion=suggest,
+            config=config,
+            declare=declare,
+            mask=_named_mask(settings),
+            allow_truncated=allow_truncated,
+            allow_implausible=settings.allow_implausible,
+            tolerance_ns=tolerance_ns,
+            overwrite=overwrite,
+        )
+        return
+    (recording,) = given
     source = Recording.open(recording, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     mask = _mask(settings, source)
     with mask_shown(out), progress(len(source), f"follow {recording.name}") as on_frame:
@@ -322,8 +354,12 @@ def _mask(settings: RecordingOptions, source: "Recording") -> "TissueMask | Fram
     Raises:
         OptionError: it cannot be read, or the recording has no images.
     """
-    from jiggle_mj.eval.runs.mask_files import mask_named
-
     if settings.mask is not None and source.camera is None:
         raise OptionError(f"--mask {settings.mask}: the recording has no images; leave it out.")
+    return _named_mask(settings)
+
+
+def _named_mask(settings: RecordingOptions) -> "TissueMask | FrameMask | None":
+    from jiggle_mj.eval.runs.mask_files import mask_named
+
     return None if settings.mask is None else mask_named(settings.mask)

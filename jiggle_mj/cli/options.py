@@ -10,10 +10,12 @@ from ..errors import OptionError
 from ..recording.pairing import MAX_PAIRING_TOLERANCE_MS
 
 PathArgument = Annotated[Path, tyro.conf.Positional]
+PathArguments = Annotated[tuple[Path, ...], tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
 RowsName = Literal["inside", "together", "images", "outside", "nothing"]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 AsJson = Annotated[bool, tyro.conf.arg(name="json")]
+SchedulerUrl = Annotated[str | None, tyro.conf.arg(metavar="dask://HOST:PORT")]
 Disturb = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[=MAGNITUDE]")]]
 Parameters = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")]]
 PAIRING_TOLERANCE_MS = 5.0

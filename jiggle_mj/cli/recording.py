@@ -3,14 +3,13 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
+from typing import TYPE_CHECKING
 
 from ..errors import OptionError
 from ..options import Sensing
-from .options import AsJson, Disturb, Name, Out
+from .options import AsJson, Disturb, Name, Out, SchedulerUrl
 from .terminal import FAILED, INTERRUPTED, bar, console, progress, stop
+from .workers import workers
 
 if TYPE_CHECKING:
     from jiggle_mj.scenes import Scene
@@ -25,7 +24,7 @@ def record(
     seed: int = 0,
     count: int | None = None,
     jobs: int | None = None,
-    executor: Annotated[str | None, tyro.conf.arg(metavar="dask://HOST:PORT")] = None,
+    executor: SchedulerUrl = None,
     disturb: Disturb = (),
     overwrite: bool = False,
     as_json: AsJson = False,
@@ -98,24 +97,17 @@ def _record_series(
     as_json: bool,
 ) -> None:
     """Record a scene with several seeds; exit with 1 where some failed, with 130 after Ctrl-C."""
-    from ..cluster import cluster
     from ..series import record_series
-    from ..worker_processes import WorkerProcesses
 
-    if jobs is not None and executor is not None:
-        raise OptionError("--jobs is for this machine, --executor for other machines: give one of them.")
     try:
-        with (
-            WorkerProcesses(jobs) if executor is None else cluster(executor) as workers,
-            bar(count, f"record {scene.name}") as advance,
-        ):
+        with workers(jobs, executor) as executing, bar(count, f"record {scene.name}") as advance:
             series = record_series(
                 scene,
                 folder,
                 count=count,
                 sensing=sensing,
                 seed=seed,
-                executor=workers,
+                executor=executing,
                 overwrite=overwrite,
                 on_done=lambda _: advance(),
             )

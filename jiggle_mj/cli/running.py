@@ -57,7 +57,7 @@ HEAVY: dict[str, tuple[str, ...]] = {
     "inspect": ("jiggle_mj.importing.bags.inspection",),
     "estimate": ("jax", "jiggle_mj.eval.runs.experiment"),
     "identify": ("jax", "jiggle_mj.estimator", "jiggle_mj.episode"),
-    "close-loop": ("jax", "jiggle_mj.eval.runs.closing_the_loop"),
+    "close-loop": ("jax", "jiggle_mj.eval.runs.closing_many"),
     "score": ("jax", "jiggle_mj.eval.runs.scoring"),
     "table": ("jax", "jiggle_mj.eval.runs.experiment", "jiggle_mj.scenes"),
     "bench": ("jax", "jiggle_mj.eval.benchmark.estimator_benchmark"),
