@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from jiggle_mj.estimator import Estimator as Estimator
     from jiggle_mj.estimator import EstimatorConfig as EstimatorConfig
     from jiggle_mj.eval.metrics.result import score as score
+    from jiggle_mj.eval.runs.closing_many import close_loops as close_loops
     from jiggle_mj.eval.runs.closing_the_loop import close_loop as close_loop
     from jiggle_mj.eval.runs.experiment import run_estimator as run_estimator
     from jiggle_mj.eval.runs.experiment import run_scene as run_scene
@@ -114,6 +115,7 @@ __all__ = [
     "WorkerProcesses",
     "__version__",
     "close_loop",
+    "close_loops",
     "import_folder",
     "load_scene",
     "problems",
@@ -147,6 +149,7 @@ _NAMES_OF_MODULE = {
     ),
     "estimate": ("Belief", "Detection", "Estimate", "Sheet"),
     "estimator": ("Estimator", "EstimatorConfig"),
+    "eval.runs.closing_many": ("close_loops",),
     "eval.runs.closing_the_loop": ("close_loop",),
     "eval.runs.experiment": ("run_estimator", "run_scene"),
     "eval.metrics.result": ("score",),

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from .result_file import Json
-
 MIN_P_VALUE = 0.05
 """P-value from which sizes agree, over all parameters of an effect together."""
 
@@ -46,7 +44,9 @@ def common_size(sizes: Sequence[float], sds: Sequence[float]) -> CommonSize | No
     return CommonSize(mean=mean, sd=float(weights.sum() ** -0.5), p_value=p_value)
 
 
-def effects_compared(found: Mapping[str, Mapping[str, Any]], *, same_at_sites: Collection[str] = ()) -> list[Json]:
+def effects_compared(
+    found: Mapping[str, Mapping[str, Any]], *, same_at_sites: Collection[str] = ()
+) -> list[dict[str, Any]]:
     """Return each effect that was added in a recording, with its size in each of them and whether these agree.
 
     Args:
@@ -65,7 +65,7 @@ def _compared(
     added: list[tuple[str, Mapping[str, Any]]],
     found: Mapping[str, Mapping[str, Any]],
     same_at_sites: Collection[str],
-) -> Json:
+) -> dict[str, Any]:
     sites = {effect["site"] for _, effect in added}
     comparable = len(sites) == 1 or name in same_at_sites
     sizes, sds = (zip(*(effect[key] for _, effect in added), strict=True) for key in ("theta", "sd"))

@@ -5,14 +5,14 @@ the same job runs again.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from jiggle_mj.argument_checks import as_instance, as_path
+from jiggle_mj.argument_checks import as_instance, as_path, as_tuple_of
 from jiggle_mj.episode import ESTIMATE, RECORDING, RESULT, check_directory, clear_directory
 from jiggle_mj.errors import JiggleError, OptionError, OutputError
 from jiggle_mj.estimator import EstimatorConfig
@@ -42,7 +42,7 @@ FIGURES = ("verdict", "effects", "ambiguous_with", "held_out", "frames", "second
 
 @fills_folder
 def close_loops(
-    recordings: Iterable[Path],
+    recordings: Sequence[Path],
     directory: Path,
     *,
     library: tuple[Effect, ...] = LIBRARY,
@@ -87,7 +87,7 @@ def close_loops(
         KeyboardInterrupt: recordings that have not begun are cancelled; complete results stay.
     """
     directory = as_path(directory, "the folder")
-    paths = _by_name([as_path(path, "a recording") for path in recordings])
+    paths = _by_name([Path(path) for path in as_tuple_of(recordings, "recordings", (str, Path))])
     if executor is not None:
         as_instance(executor, "executor", Executor, hint="WorkerProcesses() is one.")
     _check_place(directory, paths)

@@ -1,7 +1,7 @@
 """One recording of many to close the loop over: what is done with it, where, and whether it has been done.
 
 `job.json` in the folder says what the loop was closed over and with which settings. Its `seconds` are null until all
-files are there, so that a complete folder is told from one that was interrupted.
+files are there; a folder in which they are null is done again.
 """
 
 import hashlib

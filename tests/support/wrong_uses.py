@@ -223,6 +223,9 @@ def engines(folder: Path) -> Iterator[Use]:
     yield "run_estimator(3)", lambda: jm.run_estimator(3, folder / "r")
     yield "run_estimator(str)", lambda: jm.run_estimator("no.mcap", folder / "r")
     yield "close_loop(str)", lambda: jm.close_loop("no.mcap", folder / "r")
+    many = {"recordings": [folder / "a.mcap"], "directory": folder / "many"}
+    wrong = {"recordings": ("a.mcap", [], [3], None), "directory": (3,), "executor": (4, "dask")}
+    yield from changed("close_loops", jm.close_loops, many, wrong)
     yield "score(str)", lambda: jm.score("no", "no.truth.mcap")
     yield "import_folder(3)", lambda: jm.import_folder(3, None, folder / "i.mcap")
     yield "import_folder(no)", lambda: jm.import_folder(folder / "no", None, folder / "i.mcap")

@@ -185,6 +185,6 @@ def test_the_sentences_say_where_a_trivial_prediction_is_better_and_what_belongs
     found = [{"recording": name, "site": None, "theta": [0.1], "sd": [0.01]} for name in "ab"]
     tool = {"name": "tool_scale", "found": found, "this_session_alone": True, "same_site": True, "units": [""],
             "agree": False, "p_value": 0.001, "mean": [0.1], "mean_sd": [0.007]}  # fmt: skip
-    told = " ".join(summary_sentences({"recordings": [row, row | {"name": "b"}], "effects": [tool]}))
-    assert "its sizes differ (p = 0.001)" in told and "it may differ between sessions" in told
-    assert "a: that nothing moves predicts the held-out part better than the model does." in told
+    text = " ".join(summary_sentences({"recordings": [row, row | {"name": "b"}], "effects": [tool]}))
+    assert "its sizes differ (p = 0.001)" in text and "it may differ between sessions" in text
+    assert "a: that nothing moves predicts the held-out part better than the model does." in text
