@@ -18,6 +18,7 @@ ERRORS = {
     "before_rms_m": ("before", BEFORE),
     "after_rms_m": ("after", AFTER),
     "with_remainder_rms_m": ("with the remainder", "black"),
+    "unmoved_rms_m": (TRIVIAL["unmoved"], "#666666"),
     "last_frame_rms_m": (TRIVIAL["last_frame"], WITHOUT_MODEL),
     "in_proportion_rms_m": (TRIVIAL["in_proportion"], "#cccccc"),
 }

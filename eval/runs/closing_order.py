@@ -106,7 +106,8 @@ class ClosingOrder:
                 raise
             except Exception as failure:
                 traceback.print_exc(file=file)
-                raise RuntimeError(f"{type(failure).__name__}: {failure}; {self.folder / LOG} has all of it.") from None
+                why = " ".join(f"{type(failure).__name__}: {failure}".split())
+                raise RuntimeError(f"{why}; {self.folder / LOG} has all of it.") from None
         self._write_job(seconds=time.perf_counter() - began)
 
     def _write_job(self, *, seconds: float | None) -> None:

@@ -3,16 +3,15 @@
 import json
 import os
 import signal
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from jiggle_mj.cluster import cluster
 from jiggle_mj.errors import ClusterError
+from tests.support.dask_cluster import dask_cluster
 from tests.support.series import (
     COUNT,
     contents,
@@ -28,31 +27,6 @@ def open_files(pid: int) -> list[str]:
         return [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir()]
     except FileNotFoundError:
         return []
-
-
-@contextmanager
-def dask_cluster(folder: Path, n_workers: int):
-    """Start a scheduler and workers without nannies, each a process on loopback; yield the URL and the workers."""
-    address = folder / "scheduler.json"
-    started, log = [], (folder / "dask.log").open("w")
-
-    def start(*words):
-        command = [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]]
-        started.append(subprocess.Popen(command, stdout=log, stderr=log, cwd=folder))
-
-    try:
-        start(
-            "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(address)
-        )
-        until(lambda: address.exists() and address.read_text().endswith("}"))
-        for _ in range(n_workers):
-            start("dask_worker", "--scheduler-file", str(address), "--no-nanny", "--nthreads", "1", "--no-dashboard")
-        yield json.loads(address.read_text())["address"].replace("tcp://", "dask://"), started[1:]
-    finally:
-        for process in started:
-            process.kill()
-            process.wait()
-        log.close()
 
 
 def test_a_cluster_of_which_a_worker_is_killed_makes_the_same_recordings(one_by_one, tmp_path, monkeypatch, capsys):

@@ -1,10 +1,12 @@
 """`close-loop` of several recordings from the command line: exit codes, what is refused, and two real ones."""
 
 import json
+from contextlib import nullcontext
 
 import pytest
 
 from jiggle_mj.eval.runs.closing_many import PAGE, SUMMARY
+from tests.support.dask_cluster import dask_cluster
 from tests.support.tiny_scene import call, scene_file
 
 SEEDS = 2
@@ -37,17 +39,20 @@ def test_what_cannot_be_done_is_refused_before_anything_is_written(arguments, wo
     assert words in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_recordings_that_fail_are_named_and_the_exit_code_says_so(tmp_path, monkeypatch, capsys):
-    """In worker processes; one file is missing, and one is no recording. All results are written all the same."""
+@pytest.mark.parametrize("on_cluster", [False, True], ids=["processes", "cluster"])
+def test_recordings_that_fail_are_named_and_the_exit_code_says_so(on_cluster, tmp_path, monkeypatch, capsys):
+    """In other processes; one file is missing, and one is no recording. All results are written all the same."""
     out = tmp_path / "out"
     (tmp_path / "torn.mcap").write_bytes(b"torn")
-    arguments = (tmp_path / "missing.mcap", tmp_path / "torn.mcap", "--jobs", 1, "--json")
-    assert call(monkeypatch, "close-loop", *arguments, "--out", out) == 1
+    arguments = (tmp_path / "missing.mcap", tmp_path / "torn.mcap", "--json", "--out", out)
+    with dask_cluster(tmp_path, 1) if on_cluster else nullcontext() as cluster:
+        workers = ("--jobs", 1) if cluster is None else ("--executor", cluster[0])
+        assert call(monkeypatch, "close-loop", *arguments, *workers) == 1
     printed = capsys.readouterr()
     results = json.loads(printed.out)
     assert results == json.loads((out / SUMMARY).read_text())
     assert [row["name"] for row in results["recordings"] if row["failed"]] == ["missing", "torn"]
-    assert "1 of 2: missing: failed" in printed.err and "2 of 2 failed: missing, torn." in printed.err
+    assert " of 2: missing: failed" in printed.err and "2 of 2 failed: missing, torn." in printed.err
     assert "missing" in (out / PAGE).read_text()
     assert "torn.mcap" in (out / "torn" / "log.txt").read_text()
 
