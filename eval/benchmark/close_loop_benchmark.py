@@ -9,15 +9,15 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 
 from jiggle_mj.episode import observe
 from jiggle_mj.estimator.attribution.close_loop import Closed, close_the_loop
-from jiggle_mj.estimator.attribution.dataset import Dataset, collect_dataset
+from jiggle_mj.estimator.attribution.dataset import collect_dataset
 from jiggle_mj.estimator.attribution.fit import fit
 from jiggle_mj.estimator.attribution.held_out import predict_held_out
 from jiggle_mj.estimator.attribution.problem import Problem
@@ -32,6 +32,7 @@ from jiggle_mj.worker_processes import usable_cores
 from .estimator_benchmark import Metrics, peak_memory, timed
 from .reference_benchmark import sized
 
+T = TypeVar("T")
 SIZES = (600,)
 """About how many particles the sheet has."""
 EFFECT = "stretch"
@@ -115,39 +116,44 @@ def _times(recording: Recording, library: tuple[Effect, ...], log: Callable[[str
     """Return the seconds of all parts for one recording, and what was found in it."""
     metrics: Metrics = {}
 
-    def measure(name: str, call: Callable[[], object]) -> None:
+    def measure(name: str, call: Callable[[], T]) -> T:
+        """Time a part, and return its last result; earlier ones are not kept."""
         log(f"  {name}")
-        compiled, seconds = timed(call, repeats=REPEATS)
+        last: list[T] = []
+
+        def again() -> T:
+            last[:] = [call()]
+            return last[0]
+
+        compiled, seconds = timed(again, repeats=REPEATS)
         metrics[f"{name}_s"] = {"value": seconds, "unit": "s"}
         metrics[f"{name}_compile_s"] = {"value": compiled, "unit": "s"}
+        return last[0]
 
-    datasets, closings, clock = list[Dataset](), list[Closed](), PhaseClock()
+    clock = PhaseClock()
 
-    def read() -> None:
-        datasets.append(collect_dataset(recording.declaration, recording.camera, recording))
-
-    def close() -> None:
+    def close() -> Closed:
         clock.restart()
-        closings.append(close_the_loop(datasets[-1], library=library, log=clock))
+        closed = close_the_loop(dataset, library=library, log=clock)
         clock("end")
+        return closed
 
-    measure("read_and_filter", read)
-    measure("build", lambda: Problem.build(datasets[-1], library))
-    measure("close", close)
+    dataset = measure("read_and_filter", lambda: collect_dataset(recording.declaration, recording.camera, recording))
+    measure("build", lambda: Problem.build(dataset, library))
+    closed = measure("close", close)
     for seconds, line in clock.phases:
-        log(f"    {seconds:7.2f} s until: {line}")
-    closed = closings[-1]
+        log(f"    {seconds:7.2f} s until: {' '.join(line.split())}")
     problem, fitted = closed.problem, closed.contexts[0].fitted
-    parts = list(dict.fromkeys(timed_frame.part for timed_frame in datasets[-1].frames))
+    parts = list(dict.fromkeys(one.part for one in dataset.frames))
     measure("scores", lambda: scores(problem, fitted))
-    measure("one_hypothesis", partial(fit, problem, problem.sheet.place(EFFECT), fitted.point, set(parts[:-1])))
+    measure("one_hypothesis", lambda: fit(problem, problem.sheet.place(EFFECT), fitted.point, set(parts[:-1])))
     measure("held_out", lambda: predict_held_out(problem, fitted, parts[-1]))
     measure("remainder", lambda: remainder_of_fit(problem, fitted))
     whole = float(metrics["read_and_filter_s"]["value"]) + float(metrics["close_s"]["value"])
     named = ", ".join(one.effect.name for one in closed.accepted)
     return {
-        "particles": {"value": len(datasets[-1].estimator.sheet.rest), "unit": "count"},
-        "frames": {"value": len(datasets[-1].frames), "unit": "count"},
+        "particles": {"value": len(dataset.estimator.sheet.rest), "unit": "count"},
+        "frames": {"value": len(dataset.frames), "unit": "count"},
         "verdict": {"value": closed.verdict + (f": {named}" if named else ""), "unit": "name"},
         "whole_s": {"value": whole, "unit": "s"},
         **metrics,
