@@ -24,6 +24,7 @@ from jiggle_mj.recording.output_files import write_text
 
 from ..metrics.result_file import Json, read_json
 from .closing_the_loop import DISCREPANCY, OWN_FILES, close_loop
+from .compiled_functions import drop_many_compiled
 from .mask_files import mask_shown
 
 JOB, LOG = "job.json", "log.txt"
@@ -91,6 +92,7 @@ class ClosingOrder:
             RuntimeError: it raised anything else, which another process may not be able to send; the log has all of it.
         """
         clear_directory(self.folder, (*OWN_FILES, JOB, LOG))
+        drop_many_compiled()
         self._write_job(seconds=None)
         began = time.perf_counter()
         with open(self.folder / LOG, "w", encoding="utf-8") as file:

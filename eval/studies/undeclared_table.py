@@ -17,6 +17,7 @@ from jiggle_mj.scenes import Reference, programme
 
 from ..metrics.result_file import MADE_BY, read_json
 from ..runs.closing_the_loop import DISCREPANCY, close_loop
+from ..runs.compiled_functions import drop_many_compiled
 from .study import Study, Table
 from .undeclared_panel import IMAGES, INSIDE, NOTHING, OUTSIDE, ROWS, TOGETHER, PanelRow, scene_with
 
@@ -58,6 +59,7 @@ class UndeclaredStudy(Study[UndeclaredCell, Discrepancy]):
     def run_cell(self, cell: UndeclaredCell, path: Path) -> None:
         """Record the row's scene, and close the loop over the recording."""
         path.mkdir(parents=True, exist_ok=True)
+        drop_many_compiled()
         scene, recording = scene_with(cell.row, cell.seed), path / "run.mcap"
         with Reference(scene, seed=cell.seed, sensing=ROWS[cell.row].sensing) as reference:
             for _ in observe(reference, programme(scene), recording, seed=cell.seed, overwrite=True):
