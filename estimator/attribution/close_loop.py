@@ -1,16 +1,12 @@
-"""Closing the loop: find which effect the model lacks, and add it if held-out frames are predicted better with it.
+"""Closing the loop: find which effect the model lacks, and add it unless held-out frames are predicted worse with it.
 
-Fit the declared model, score every effect by the residual, and refit with each of the likeliest. Some of these beat
-larger unexplained errors, have a plausible size and predict the held-out parts better. Keep the one with the largest
-log Bayes factor over the fourth root of its held-out error. Repeat for a second and a third effect.
-
-Effects with which the part that chose none is predicted worse are taken out again. What stays unexplained becomes a
-remainder without a name.
+Fit the declared model, search for hypotheses with more evidence (`hypotheses`), and let all evidences decide
+(`verdict`). Effects with which the part that chose none is predicted worse are taken out again. What stays unexplained
+becomes a remainder without a name.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,28 +15,19 @@ from jiggle_mj.errors import RecordingError
 
 from ..effects import LIBRARY, Effect
 from .dataset import Dataset
-from .fit import MAX_STIFFNESS, Fitted, discounted, fit, start
+from .fit import fit
+from .gauss_newton import MAX_STIFFNESS, Fitted, start
 from .held_out import HeldOut, held_out, predict_held_out
-from .hypotheses import MAX_UNEXPLAINED_GAIN, FitContext, Hypothesis, leave_one_out
-from .problem import Problem
+from .hypotheses import Hypothesis, hypothesis_of, leave_one_out, search
+from .problem import Point, Problem
 from .remainder import FittedRemainder, remainder_of_fit
-from .search import MAX_EFFECTS, AddedHypothesis, Refused, following, revised
-from .unexplained_residual import unexplained_residual
+from .scores import parameters_sd
+from .starts import ObservedStates
 from .user_effects import check_effects
+from .verdict import EvidenceVerdict, decide
 
-MAX_EXCESS = 5.0
-"""Largest mean squared standardised residual of held-out parts with which the residual still counts as explained."""
 UNEXPLAINED = ("unexplained", "effect-with-remainder")
 """Verdicts with an unexplained residual."""
-
-
-class SearchStep(NamedTuple):
-    """A state of the search."""
-
-    added: list[AddedHypothesis]
-    """Effects in the model."""
-    context: FitContext
-    """The fit with them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,18 +35,22 @@ class Closed:
     """Result of closing the loop."""
 
     verdict: str
-    """Verdict: no-effect, effect, ambiguous, effect-with-remainder or unexplained."""
-    accepted: list[Hypothesis]
-    """Effects that were added, in order."""
-    rivals: list[list[Hypothesis]]
-    """Effects that are indistinguishable from each of the accepted ones."""
-    refused: Refused
-    """Effects that were fitted and not added, with the reason."""
-    contexts: list[FitContext]
-    """Fits after each addition; the first is of the declared model."""
-    final: Fitted
-    """The last fit. Where a residual is unexplained, its information is discounted by the mean squared standardised
-    residual of held-out parts, so that fewer particles count as attached because of a cause without a name."""
+    """EvidenceVerdict: no-effect, effect, ambiguous, effect-with-remainder or unexplained."""
+    declared: Hypothesis
+    """The declared model."""
+    final: Hypothesis
+    """The declared model with the effects that were added."""
+    rivals: list[Hypothesis]
+    """Hypotheses with effects that these frames do not distinguish from the last one; see `EvidenceVerdict.rivals`."""
+    hypotheses: list[tuple[Hypothesis, float]]
+    """All hypotheses that were fitted, with their probabilities, the likeliest first."""
+    dropped: dict[str, str]
+    """Effects that were taken out again, with the reason."""
+    folds: tuple[list[HeldOut], list[HeldOut]]
+    """Predictions of each part by fits without it, of the declared model and of the last one."""
+    sds: np.ndarray
+    """Standard deviation of the added effects' parameters: by their covariance, or by how much they change without one
+    part, whichever is larger."""
     reported: tuple[HeldOut, HeldOut] | None
     """Predictions, before and after, of a part that chose no effect; None if there was only one part. The error after
     is never larger than before."""
@@ -93,99 +84,84 @@ def close_the_loop(
     if dataset.left_out:
         log(f"{len(dataset.left_out)} frames excluded: the held particles are observed in another shape there")
     log(f"fitting {len(problem.frames(used))} frames in {len(used)} parts with the declared model")
-    steps, refused = _search(problem, _declared(problem, dataset, used, log), used, log)
+    observed, begun = _filter_estimate(problem, dataset, used)
+    fits = fit(problem, np.zeros(0, dtype=int), [begun, *observed.starts(np.zeros(0, dtype=int))], used, log=log)
+    check_finite(fits.likeliest)
+    declared = hypothesis_of(fits)
+    found = search(declared, observed, used, log)
+    decision = decide([one.evidence for one in found], len(problem.sheet.library))
+    path = found[decision.best].path
     predicted = list[HeldOut]()
     if spare is not None:
-        predicted = [predict_held_out(problem, step.context.fitted, spare) for step in steps]
-        steps, predicted, dropped = carried_over(steps, predicted)
-        refused += dropped
-        for one, why in dropped:
-            log(f"{one.effect.name} taken out again: {why}")
-    added, contexts = steps[-1].added, [step.context for step in steps]
-    accepted, names = [one.hypothesis for one in added], {one.hypothesis.effect.name for one in added}
-    rivals = [[one for one in group.rivals if one.effect.name not in names] for group in added]
-    refused += [pair for group in added for pair in group.others]
-    last_reasons = {one.effect.name: (one, why) for one, why in refused}
-    named = names | {one.effect.name for group in rivals for one in group}
-    last = contexts[-1]
-    left = remainder_of_fit(problem, last.fitted)
-    with_remainder = None if spare is None else predicted[-1].beyond(*left.of(problem.history.frames, spare))
-    folds = [HeldOut.together(last.folds)] if last.folds else []
-    too_large = any(one.excess > MAX_EXCESS for one in folds + predicted[-1:])
-    unexplained = too_large or last.unexplained.gain > MAX_UNEXPLAINED_GAIN
-    verdict, final = _verdict(accepted, rivals, unexplained), last.fitted
-    if verdict in UNEXPLAINED and folds:
-        excess = max(folds[0].excess, 1.0)
-        log(f"information divided by {excess:.1f}, the mean squared standardised residual of held-out parts")
-        final = discounted(problem, final, excess)
+        predicted = [predict_held_out(one.fitted, spare) for one in path]
+    path, predicted, dropped = carried_over(path, predicted)
+    for name, why in dropped.items():
+        log(f"{name} taken out again: {why}")
+    last = path[-1]
+    left = remainder_of_fit(last.fitted)
+    before, after = (leave_one_out(one.fitted, used) for one in (declared, last))
+    thetas = [one.point.theta[last.fitted.named] for one in after.values()]
     return Closed(
-        verdict=verdict,
-        accepted=accepted,
-        rivals=rivals,
-        refused=[pair for name, pair in last_reasons.items() if name not in named],
-        contexts=contexts,
-        final=final,
+        verdict=_verdict(decision, last, dropped),
+        declared=declared,
+        final=last,
+        rivals=[found[k] for k in decision.rivals if found[k].added] if not dropped else [],
+        hypotheses=[(found[k], float(decision.probabilities[k])) for k in np.argsort(-decision.probabilities)],
+        dropped=dropped,
+        folds=(held_out(before), held_out(after)),
+        sds=np.maximum(parameters_sd(last.fitted), jackknife_sd(thetas, len(last.fitted.named))),
         reported=(predicted[0], predicted[-1]) if predicted else None,
         remainder=left,
-        with_remainder=with_remainder,
+        with_remainder=None if spare is None else predicted[-1].beyond(*left.of(problem.history.frames, spare)),
         problem=problem,
     )
 
 
-def _search(
-    problem: Problem, declared: FitContext, used: set[int], log: Callable[[str], None]
-) -> tuple[list[SearchStep], Refused]:
-    """Return the steps of the search, the first without effects, and the hypotheses that were refused beside them."""
-    steps, refused = [SearchStep([], declared)], Refused()
-    while len(steps[-1].added) < MAX_EFFECTS:
-        found, more = following(problem, steps[-1].context, steps[-1].added, used, log)
-        refused += more
-        if found is steps[-1].added:
-            break
-        steps.append(SearchStep(found, found[-1].context))
-        log(f"effects so far: {', '.join(one.hypothesis.effect.name for one in found)}")
-    if len(steps[-1].added) > 1:
-        added = revised(problem, steps[-1].added, used, log)
-        steps.append(SearchStep(added, added[-1].context))
-    return steps, refused
-
-
-def carried_over(steps: list[SearchStep], predicted: list[HeldOut]) -> tuple[list[SearchStep], list[HeldOut], Refused]:
-    """Return the steps up to the last one that predicts a part no worse than the first, and what is taken out again.
+def carried_over(
+    path: list[Hypothesis], predicted: list[HeldOut]
+) -> tuple[list[Hypothesis], list[HeldOut], dict[str, str]]:
+    """Return the path up to the last hypothesis that predicts a part no worse than the first, and what is taken out.
 
     Args:
-        steps: effects in the model, and the fit with them.
-        predicted: prediction of the part by each.
+        path: hypotheses, each with one effect more.
+        predicted: prediction of the part by each; empty if there is no such part.
     """
+    if not predicted:
+        return path, predicted, {}
     last = max(k for k, one in enumerate(predicted) if not one.rms > predicted[0].rms)
-    kept = {one.hypothesis.effect.name for one in steps[last].added}
     errors = f"{1e3 * predicted[-1].rms:.2f} mm with it and {1e3 * predicted[0].rms:.2f} mm with what is declared"
     why = f"it did not carry over: the part that chose no effect is predicted to {errors}"
-    dropped = [(one.hypothesis, why) for one in steps[-1].added if one.hypothesis.effect.name not in kept]
-    return steps[: last + 1], predicted[: last + 1], dropped
+    dropped = {name: why for name in path[-1].names if name not in path[last].names}
+    return path[: last + 1], predicted[: last + 1], dropped
 
 
-def _declared(problem: Problem, dataset: Dataset, used: set[int], log: Callable[[str], None]) -> FitContext:
-    """Return the fit without effects, started from the filter's estimate."""
-    detection = dataset.detection
+def _verdict(decision: EvidenceVerdict, last: Hypothesis, dropped: dict[str, str]) -> str:
+    """Return the verdict of the evidences; where effects were taken out again, that something stays unexplained."""
+    if not dropped:
+        return decision.kind
+    return "effect-with-remainder" if last.added else "unexplained"
+
+
+def _filter_estimate(problem: Problem, dataset: Dataset, used: set[int]) -> tuple[ObservedStates, Point]:
+    """Return the filter's states, and the equilibria with its stiffnesses."""
+    detection, frames = dataset.detection, problem.frames(used)
     b = jnp.asarray(np.where(detection.attached, detection.stiffness, 0.0))
     s = np.minimum(np.asarray(problem.prior.bounded(b)), MAX_STIFFNESS)
     states = np.array([timed.state for timed in dataset.frames])
-    point = start(problem, np.zeros(problem.sheet.size), s, states, problem.frames(used))
-    fitted = fit(problem, np.zeros(0, dtype=int), point, used, log=log)
-    check_finite(problem, fitted)
-    folds = held_out(problem, leave_one_out(problem, fitted, used))
-    return FitContext(fitted=fitted, unexplained=unexplained_residual(problem, fitted), folds=folds, scores=[])
+    return (
+        ObservedStates.around(problem, s, states, frames),
+        start(problem, np.zeros(problem.sheet.size), s, states, frames),
+    )
 
 
-def check_finite(problem: Problem, fitted: Fitted) -> None:
+def check_finite(fitted: Fitted) -> None:
     """Refuse a fit of the declared model that does not predict all of its frames.
 
     Raises:
         RecordingError: the normal equations of a frame are not finite.
     """
     found = [
-        problem.history.frames[k].index
+        fitted.problem.history.frames[k].index
         for k, one in fitted.equations.items()
         if not np.isfinite(np.asarray(one.square)).all()
     ]
@@ -198,9 +174,13 @@ def check_finite(problem: Problem, fitted: Fitted) -> None:
         )
 
 
-def _verdict(accepted: list[Hypothesis], rivals: list[list[Hypothesis]], unexplained: bool) -> str:
-    if not accepted:
-        return "unexplained" if unexplained else "no-effect"
-    if unexplained:
-        return "effect-with-remainder"
-    return "ambiguous" if any(rivals) else "effect"
+def jackknife_sd(thetas: list[np.ndarray], size: int) -> np.ndarray:
+    """Return the jackknife standard error of parameters from fits without one part each; zero if there is none.
+
+    Grasps disagree by more than their noise where the model is wrong in other ways too [Miller 1974,
+    doi:10.1093/biomet/61.1.1]. Each fit is one step from that to all parts, so that this is a lower bound.
+    """
+    if not thetas:
+        return np.zeros(size)
+    deviation = np.array(thetas) - np.mean(thetas, axis=0)
+    return np.sqrt((len(thetas) - 1) / len(thetas) * np.sum(deviation**2, axis=0))

@@ -8,7 +8,7 @@ from jiggle_mj.observation import Declaration
 
 from ..effects import Effect
 from .close_loop import Closed
-from .fit import MAX_EFFECT
+from .gauss_newton import MAX_EFFECT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class CorrectedParameter:
 def corrected_parameters(closed: Closed, declaration: Declaration) -> dict[str, CorrectedParameter]:
     """Return the effects that were added, by the name that a declaration gives them."""
     found: dict[str, CorrectedParameter] = {}
-    for one in closed.accepted:
+    for one in closed.final.added:
         effect, reach = one.effect, MAX_EFFECT * np.asarray(one.effect.prior_sds[one.score.site])
         name = effect.name if effect.sites == 1 else f"{effect.name}.{one.score.site}"
         nominal = np.asarray(declaration.effects.get(name, np.zeros(len(effect.prior_sd))))
@@ -38,7 +38,7 @@ def corrected_parameters(closed: Closed, declaration: Declaration) -> dict[str, 
         found[name] = CorrectedParameter(
             effect=effect,
             nominal=tuple(nominal.tolist()),
-            value=tuple((nominal + one.theta).tolist()),
+            value=tuple((nominal + closed.final.theta(one)).tolist()),
             min_value=tuple((np.maximum(lowest, 0) if effect.non_negative else lowest).tolist()),
             max_value=tuple((nominal + reach).tolist()),
         )

@@ -10,7 +10,7 @@ from jiggle_mj.estimate import Detection
 from .close_loop import Closed
 from .dataset import Dataset
 from .held_out import rms
-from .hypotheses import Hypothesis, reported_sd
+from .hypotheses import Hypothesis
 from .localisation import localisation
 from .suggestion import Suggestion
 from .trivial_predictions import TRIVIAL, trivial_predictions
@@ -21,13 +21,14 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
 
     `suggestion` and the detections are None, to be filled in later.
     """
-    first, last = closed.contexts[0], closed.contexts[-1]
-    noise, before = dataset.noise, localisation(closed.problem, first.fitted)
+    noise, before = dataset.noise, localisation(closed.declared.fitted)
+    accepted = closed.final.names
     return {
         "verdict": closed.verdict,
-        "effects": [_effect(closed, *pair) for pair in zip(closed.accepted, closed.rivals, strict=True)],
-        "ambiguous_with": list(dict.fromkeys(one.effect.name for rivals in closed.rivals for one in rivals)),
-        "refused": [{"name": one.effect.name, "why": why} for one, why in closed.refused],
+        "posterior": [_probability(*pair) for pair in closed.hypotheses],
+        "effects": [_effect(closed, k) for k in range(len(accepted))],
+        "ambiguous_with": _beside(closed.rivals, accepted),
+        "refused": refused(closed),
         "tested": [effect.name for effect in closed.problem.sheet.library],
         "scores": [
             {
@@ -36,21 +37,12 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
                 "p_value": one.p_value,
                 "information_kept": one.kept,
             }
-            for one in first.scores
-        ],
-        "unexplained_residual": [
-            {
-                "gain": context.unexplained.gain,
-                "force_variance": context.unexplained.variance,
-                "smooth_amplitude": context.unexplained.amplitude,
-                "tool_variance": context.unexplained.tool_variance,
-            }
-            for context in closed.contexts
+            for one in closed.declared.scores
         ],
         "held_out": {
             "folds": [
                 {"before_rms_m": before.rms, "after_rms_m": after.rms}
-                for before, after in zip(first.folds, last.folds, strict=True)
+                for before, after in zip(*closed.folds, strict=True)
             ],
             **_reported(closed, dataset),
         },
@@ -66,7 +58,7 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
         },
         "frames": {"used": len(dataset.frames), "left_out": list(dataset.left_out)},
         "localisation": before,
-        "localisation_after": before if closed.final is first.fitted else localisation(closed.problem, closed.final),
+        "localisation_after": before if closed.final is closed.declared else localisation(closed.final.fitted),
         "attachments": {"from": "fit", "why": None},
         "suggestion": None,
         "detection_before": None,
@@ -86,19 +78,68 @@ def attachments(found: dict[str, Any], detection: Detection | str) -> dict[str, 
     }
 
 
-def _effect(closed: Closed, one: Hypothesis, rivals: list[Hypothesis]) -> dict[str, Any]:
+def refused(closed: Closed) -> list[dict[str, str]]:
+    """Return the effects that were fitted and are not named, with the reason for each."""
+    best, _ = closed.hypotheses[0]
+    named = {*closed.final.names, *_beside(closed.rivals, ())}
+    reasons = {name: why for name, why in closed.dropped.items() if name not in named}
+    for one, probability in closed.hypotheses:
+        for name in one.names:
+            if name not in named:
+                title, lead = " and ".join(best.names) or "nothing", best.log_evidence - one.log_evidence
+                with_others = f" beside {' and '.join(set(one.names) - {name})}" if len(one.names) > 1 else ""
+                why = f"its probability{with_others} is {probability:.2g}; {title} leads by {lead:.0f} nat"
+                reasons.setdefault(name, why)
+    return [{"name": name, "why": why} for name, why in reasons.items()]
+
+
+def _probability(one: Hypothesis, probability: float) -> dict[str, Any]:
+    scales = one.fitted.problem.scales
+    return {
+        "effects": list(one.names),
+        "probability": probability,
+        "log_evidence": one.log_evidence,
+        "variances": {"force": scales.force, "fields": scales.fields, "tool": scales.tool},
+        "larger_errors": scales.larger,
+    }
+
+
+def _beside(rivals: list[Hypothesis], names: tuple[str, ...]) -> list[str]:
+    """Return the effects of some hypotheses that are not among these names."""
+    return list(dict.fromkeys(name for one in rivals for name in one.names if name not in names))
+
+
+def _effect(closed: Closed, k: int) -> dict[str, Any]:
+    """Return what is known of an added effect."""
+    last, one = closed.final, closed.final.added[k]
+    step = last.path[max(1, k + len(last.path) - len(last.added))]
+    assert step.before is not None
+    own = np.isin(last.fitted.named, one.at)
+    rivals = [rival for rival in closed.rivals if one.effect.name not in rival.names]
     return {
         "name": one.effect.name,
         "site": one.score.site if one.effect.sites > 1 else None,
-        "theta": one.theta.tolist(),
-        "sd": reported_sd(closed.problem, one).tolist(),
+        "theta": last.theta(one).tolist(),
+        "sd": reported_sd(closed, one.at, closed.sds[own]).tolist(),
         "units": list(one.effect.units),
-        "log_bayes_factor": one.log_bayes_factor,
+        "log_bayes_factor": step.log_evidence - step.before.log_evidence,
         "p_value": one.score.p_value,
         "this_session_alone": one.effect.sensing,
-        "indistinguishable_from": [rival.effect.name for rival in rivals],
+        "indistinguishable_from": _beside(rivals, last.names),
         "often_confused_with": list(one.effect.confounded_with),
     }
+
+
+def reported_sd(closed: Closed, at: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Return the standard deviation that is reported for an effect's parameters.
+
+    The model's errors are partly the same in all grasps, and do not average out over them: so it is that of one part
+    alone. The prior of the nuisance parameter of the same name is added, which may have either sign.
+    """
+    problem = closed.problem
+    own = dict(zip(problem.own.tolist(), problem.own_sd.tolist(), strict=True))
+    alone = np.sqrt(max(len(closed.folds[1]), 1)) * sd
+    return np.hypot(alone, [own.get(k, 0.0) for k in at.tolist()])
 
 
 def suggested(found: Suggestion) -> dict[str, Any]:

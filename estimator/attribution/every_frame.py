@@ -1,7 +1,8 @@
-"""All frames of a recording at a point: their weights, normal equations, residuals and cost."""
+"""All frames of a recording at a point: their weights, normal equations, residuals and likelihood."""
 
 from collections.abc import Callable, Iterable
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,7 +15,7 @@ from .linear import NormalEquations, WeightedResiduals, misfit, normal_equations
 from .normal_equations import less_offset
 from .problem import Point, Problem
 
-N_DIRECTIONS = 22
+N_DIRECTIONS = 32
 """Number of parameters that most fits pad to, so that one compilation serves them."""
 
 
@@ -47,34 +48,49 @@ def linearised(
     return _each(problem, point, weights, one)
 
 
-def cost_under(problem: Problem, weights: dict[int, FrameLikelihood], point: Point) -> float:
-    """Return twice the negative log likelihood of a point's predictions [nat], under weights of another point."""
-    return cost(problem, weights, residual(problem, weights, point), problem.amplitude)
+def misfit_under(problem: Problem, weights: dict[int, FrameLikelihood], point: Point) -> float:
+    """Return the weighted squared residuals of a point's predictions [nat, doubled], under weights of another point."""
+    return misfit_of(problem, weights, residual(problem, weights, point))
+
+
+def log_determinants(problem: Problem, weights: dict[int, FrameLikelihood]) -> float:
+    """Return the log determinant of all observations' covariance, the smooth fields and the tool included [nat]."""
+    total = 3 * len(weights) * float(np.log(problem.scales.tool))
+    for frames in problem.by_part(weights).values():
+        among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
+        with np.errstate(invalid="ignore"):  # where a point has no finite weights, the caller refuses it
+            total += float(np.linalg.slogdet(np.eye(N_FIELDS) + problem.amplitude**2 * among)[1])
+    every = parallel_map(lambda k: float(_log_determinant(weights[k])), weights)
+    return total + sum(every.values())
 
 
 def residual(problem: Problem, weights: dict[int, FrameLikelihood], point: Point) -> dict[int, WeightedResiduals]:
     """Return the weighted residuals of a point's predictions in each frame, under weights of another point."""
-    theta = jnp.asarray(point.theta)
+    theta, s = jnp.asarray(point.theta), jnp.asarray(point.s)
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> WeightedResiduals:
-        return misfit(problem.sheet, weights[k], theta, frame, context, x)
+        return misfit(problem.sheet, weights[k], theta, s, frame, context, x)
 
     return _each(problem, point, weights, one)
 
 
-def cost(
-    problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals], amplitude: float
-) -> float:
-    """Return twice the negative log likelihood of residuals [nat], for an amplitude of the smooth force fields."""
+def misfit_of(problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals]) -> float:
+    """Return weighted squared residuals [nat, doubled], with the smooth force fields eliminated grasp by grasp."""
     total = 0.0
     for frames in problem.by_part(weights).values():
         tool = np.array([np.asarray(every[k].tool)[:, None] for k in frames])
         fields = np.sum([np.asarray(every[k].fields) for k in frames], axis=0)
-        middle = np.sum([np.asarray(weights[k].among) for k in frames], axis=0) + np.eye(N_FIELDS) / amplitude**2
+        among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
         total += sum(float(every[k].squared) for k in frames)
-        total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0]
-        total -= fields @ np.linalg.solve(middle, fields)
+        total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0] / problem.scales.tool
+        total -= fields @ np.linalg.solve(among + np.eye(N_FIELDS) / problem.amplitude**2, fields)
     return float(total)
+
+
+@eqx.filter_jit
+def _log_determinant(likelihood: FrameLikelihood) -> Float[Array, ""]:
+    """Return a frame's log determinant as a compiled program."""
+    return likelihood.log_determinant()
 
 
 def _each(

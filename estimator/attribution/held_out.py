@@ -6,15 +6,16 @@ from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.stats import norm
 
 from ..belief.gaussian_information import GaussianInformation
 from ..parallel_map import parallel_map
-from .every_frame import weighed
-from .fit import Fitted
+from .every_frame import directions, weighed
 from .frame_likelihood import FrameLikelihood
+from .gauss_newton import Fitted
 from .grasped_frames import ClosedFrame
+from .linear import parameter_forces
 from .problem import Point, Problem
 from .sheet import predict_all
 
@@ -28,10 +29,11 @@ HELD_STIFFNESS = 1e6
 class Variances:
     """Variances of the residuals of a held-out prediction, by their causes [m^2]."""
 
-    stiffness: Float[np.ndarray, "m 3"]
-    """Variance by what the fit leaves open of the stiffnesses."""
+    fit: Float[np.ndarray, "m 3"]
+    """Variance by what the fit leaves open of the stiffnesses and the parameters."""
     others: Float[np.ndarray, "m 3"]
-    """Variance by force errors of the model and the noise of observed positions; or by the remainder instead."""
+    """Variance by force errors of the model, its smooth fields and the noise of observed positions, of the sizes that
+    were fitted; or by the remainder instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,17 +53,12 @@ class HeldOut:
     @property
     def sd(self) -> Float[np.ndarray, "m 3"]:
         """Return the standard deviation of the residual under the fit [m]."""
-        return np.sqrt(self.variances.stiffness + self.variances.others)
+        return np.sqrt(self.variances.fit + self.variances.others)
 
     @property
     def rms(self) -> float:
         """Return the root mean square distance [m]."""
         return rms(self.residual)
-
-    @property
-    def excess(self) -> float:
-        """Return the mean squared standardised residual: 1 if the fit states its errors correctly."""
-        return float(np.mean((self.residual / self.sd) ** 2))
 
     @property
     def nll(self) -> float:
@@ -86,32 +83,33 @@ class HeldOut:
         return HeldOut(
             residual=np.concatenate([part.residual for part in parts]),
             compute_variances=lambda: Variances(
-                stiffness=np.concatenate([part.variances.stiffness for part in parts]),
+                fit=np.concatenate([part.variances.fit for part in parts]),
                 others=np.concatenate([part.variances.others for part in parts]),
             ),
         )
 
 
-def held_out(problem: Problem, fits: dict[int, Fitted]) -> list[HeldOut]:
+def held_out(fits: dict[int, Fitted]) -> list[HeldOut]:
     """Return the prediction of each part by the fit without it."""
-    return list(parallel_map(lambda part: predict_held_out(problem, fits[part], part), fits).values())
+    return list(parallel_map(lambda part: predict_held_out(fits[part], part), fits).values())
 
 
-def predict_held_out(problem: Problem, fitted: Fitted, part: int) -> HeldOut:
+def predict_held_out(fitted: Fitted, part: int) -> HeldOut:
     """Return the prediction of one part that was not fitted to."""
+    problem = fitted.problem
     frames = problem.frames({part})
     predicted, closed = from_rest(problem, fitted.point, frames, by_tool=True), problem.history.frames
 
     def variances() -> Variances:
-        weights, known = weighed(problem, predicted, frames), _covariance(problem, fitted)
+        weights, known = weighed(problem, predicted, frames), _covariance(fitted)
 
         def one(k: int) -> Variances:
-            return _variances(problem, weights[k], closed[k].frame, known, jnp.asarray(predicted.states[k]))
+            return _variances(fitted, predicted, weights[k], k, known)
 
         every = parallel_map(one, frames)
         counted = {k: np.asarray(closed[k].frame.counted) for k in frames}
         return Variances(
-            stiffness=np.concatenate([every[k].stiffness[counted[k]] for k in frames]),
+            fit=np.concatenate([every[k].fit[counted[k]] for k in frames]),
             others=np.concatenate([every[k].others[counted[k]] for k in frames]),
         )
 
@@ -154,36 +152,56 @@ def from_rest(problem: Problem, point: Point, frames: list[int], *, by_tool: boo
     return replace(point, states=states, seen=seen)
 
 
-def _covariance(problem: Problem, fitted: Fitted) -> Float[np.ndarray, "n n"]:
-    """Return the covariance of a fit's s."""
+def _covariance(fitted: Fitted) -> Float[np.ndarray, "k k"]:
+    """Return the covariance of a fit's s and free parameters."""
     n, d = len(fitted.site_precision), len(fitted.free)
     joint = GaussianInformation.from_normal_equations(fitted.square, s=n, theta=d)
     joint = joint.with_independent("s", fitted.site_precision)
-    return np.asarray(joint.with_independent("theta", problem.sd(fitted.named) ** -2).covariance("s"))
+    return np.asarray(joint.with_independent("theta", fitted.problem.sd(fitted.named) ** -2).covariance())
 
 
 def _variances(
-    problem: Problem,
-    likelihood: FrameLikelihood,
-    seen: ClosedFrame,
-    known: Float[np.ndarray, "n n"],
-    x: Float[Array, "n 3"],
+    fitted: Fitted, predicted: Point, likelihood: FrameLikelihood, k: int, known: Float[np.ndarray, "k k"]
 ) -> Variances:
-    """Return the variances of each observed coordinate; `known` is the covariance of s."""
-    n, frame, held = len(x), likelihood.frame, np.asarray(seen.held)
+    """Return the variances of each observed coordinate of frame k; `known` is the covariance of s and parameters."""
+    problem, n = fitted.problem, len(likelihood.seen)
+    by_force, by_fit = responses(fitted, predicted, likelihood, k)
+    error = np.asarray(problem.sheet.balance.error(jnp.asarray(predicted.states[k])))
+    fields = np.einsum("ani,nij->aj", by_force, np.asarray(likelihood.fields)) * problem.amplitude
+    wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2)) + np.sum(fields**2, axis=1)
+    unsure = np.sum((by_fit @ known) * by_fit, axis=1)
+    return Variances(
+        fit=np.maximum(unsure, 0).reshape(n, 3),
+        others=wrong.reshape(n, 3) + noise_variance(problem, problem.history.frames[k].frame)[:, None],
+    )
+
+
+def responses(
+    fitted: Fitted, predicted: Point, likelihood: FrameLikelihood, k: int
+) -> tuple[Float[np.ndarray, "m n 3"], Float[np.ndarray, "m j"]]:
+    """Return how the residual of each coordinate of frame k moves with a force on each particle, and with s and theta.
+
+    It is H^-1 times the forces, with what is held fixed.
+    """
+    problem, n = fitted.problem, len(likelihood.seen)
+    closed, states = problem.history.frames[k].frame, jnp.asarray(predicted.states)
+    held = np.asarray(closed.held)
     rows = np.zeros((n + 1, 3, n + 1, 3))
     neighbours = np.asarray(likelihood.balance.neighbours)
-    rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(np.asarray(frame.dr_dx), 2, 3).swapaxes(2, 3)
+    slope = np.asarray(likelihood.frame.dr_dx)
+    rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(slope, 2, 3).swapaxes(2, 3)
     H = rows[:n, :, :n].reshape(3 * n, 3 * n)
     H[np.repeat(held, 3)] = 0.0
     H[np.repeat(held, 3), np.repeat(held, 3)] = HELD_STIFFNESS
-    inverse = np.linalg.inv(H)
-    force = np.where(held, 0.0, np.asarray(problem.sheet.balance.error(x)))
-    wrong = np.sum((inverse.reshape(3 * n, n, 3) * force[None, :, None]) ** 2, axis=(1, 2))
-    slope = np.where(held[:, None], 0.0, np.asarray(frame.dr_ds))
-    response = np.einsum("ani,ni->an", inverse.reshape(3 * n, n, 3), slope)
-    unsure = np.sum((response @ known) * response, axis=1)
-    return Variances(
-        stiffness=np.maximum(unsure, 0).reshape(n, 3),
-        others=wrong.reshape(n, 3) + noise_variance(problem, seen)[:, None],
-    )
+    by_force = np.where(held[None, :, None], 0.0, np.linalg.inv(H).reshape(3 * n, n, 3))
+    of_parameters = parameter_forces(
+        problem.sheet,
+        likelihood,
+        jnp.asarray(predicted.theta),
+        jnp.asarray(directions(problem, fitted.free)),
+        closed,
+        problem.history.context(k, states),
+    )[:, :, : len(fitted.free)]
+    by_s = np.einsum("ani,ni->an", by_force, np.asarray(likelihood.frame.dr_ds))
+    by_theta = np.einsum("ani,nij->aj", by_force, np.asarray(of_parameters))
+    return by_force, np.concatenate([by_s, by_theta], axis=1)

@@ -1,184 +1,185 @@
-"""Fit effects to the residual: which are fitted, from which start, and how well each predicts held-out parts."""
+"""Search for the hypotheses with the most evidence: sets of effects, by a beam.
+
+The effects that a fit lacks most, by their scores, are added to it one by one and fitted. The likeliest few of the new
+hypotheses are searched on from, until none is likelier than the best before. At last each effect of the best is left
+out.
+"""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..effects import Effect
 from ..parallel_map import parallel_map
-from .every_frame import cost_under
-from .fit import Fitted, fit, moved, without
-from .held_out import HeldOut, held_out
-from .problem import Point, Problem
-from .scores import Score, bayes_factor, occam, scores
-from .unexplained_residual import UnexplainedResidual, unexplained_residual
+from .evidence import log_model_evidence
+from .fit import Fits, fit, without
+from .gauss_newton import Fitted, moved
+from .scores import Score, scores
+from .starts import ObservedStates, stepped
+from .verdict import HypothesisEvidence, log_posterior
 
-N_FITTED = 3
-"""Number of effects that are fitted, the likeliest by their scores."""
-MIN_LOG_BAYES_FACTOR = 10.0
-"""Log Bayes factor from which an effect is fitted, and by which it must lead larger unexplained errors [nat]."""
-MAX_UNEXPLAINED_GAIN = 60.0
-"""Largest gain of larger unexplained errors with which the residual still counts as explained [nat]."""
+MAX_EFFECTS = 3
+"""Largest number of effects of a hypothesis."""
+BEAM = 3
+"""Hypotheses of each size that are searched on from."""
+REACH = 4.0
+"""Difference of log posterior from the best up to which hypotheses are searched on from [nat]."""
+MIN_SCORE = 5.0
+"""Log Bayes factor of one step from which an effect is fitted [nat]. The prior alone is against each by 4."""
+N_FITTED = 4
+"""Number of effects that are fitted in addition to a hypothesis, the likeliest by their scores."""
 COMPARED_SHARE = 0.5
-"""Share of the best log Bayes factor from which effects are compared by held-out predictions; and fitted, if they are
-often confused with the best."""
-MAX_PRIOR_SDS = 3.5
-"""Largest plausible size of a parameter [prior standard deviations]."""
-MAX_START_SDS = 2.0
-"""Largest size of a parameter at the start of a fit [prior standard deviations]."""
+"""Share of the best score from which effects are fitted too that are often confused with the best."""
+Log = Callable[[str], None]
+"""Receiver of progress messages."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AddedEffect:
+    """An effect in a hypothesis."""
+
+    effect: Effect
+    """The effect."""
+    score: Score
+    """Its score in the fit without it."""
+    at: np.ndarray
+    """Indices of its parameters."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
-    """A fitted effect."""
+    """A set of effects, fitted together."""
 
-    score: Score
-    """Score of the effect in the fit without it."""
-    effect: Effect
-    """The effect."""
-    fitted: Fitted
-    """Fit with the effect in the model."""
-    log_bayes_factor: float
-    """Log Bayes factor against the fit without it, the smaller one under either's weights [nat]."""
-    at: np.ndarray
-    """Indices of its parameters."""
-    sds: np.ndarray
-    """Standard deviation of all effects' parameters in the fit: by its covariance, or by how much they change without
-    one part, whichever is larger."""
-    unexplained: UnexplainedResidual | None = None
-    """Unexplained residual of the fit; None before `refined`."""
-    folds: list[HeldOut] | None = None
-    """Prediction of each part by the fit without it; None before `refined`."""
-
-    @property
-    def theta(self) -> np.ndarray:
-        """Return the effect's parameters."""
-        return self.fitted.point.theta[self.at]
-
-    @property
-    def sd(self) -> np.ndarray:
-        """Return the standard deviations of the effect's parameters."""
-        return self.sds[np.isin(self.fitted.named, self.at)]
-
-    @property
-    def held_out_rms(self) -> float:
-        """Return the root mean square error of all held-out parts [m]; without any, minus the log Bayes factor."""
-        return HeldOut.together(self.folds).rms if self.folds else -self.log_bayes_factor
-
-    @property
-    def sensible(self) -> bool:
-        """Return whether the size of all parameters is plausible under the prior."""
-        return bool(np.all(np.abs(self.theta) <= MAX_PRIOR_SDS * np.asarray(self.effect.prior_sds[self.score.site])))
-
-
-@dataclass(frozen=True, kw_only=True)
-class FitContext:
-    """A fit before or after an effect is added, with what further effects are compared to."""
-
-    fitted: Fitted
-    """The fit."""
-    unexplained: UnexplainedResidual
-    """Unexplained residual of the fit."""
-    folds: list[HeldOut]
-    """Prediction of each part by the fit without it; empty if there are fewer than two."""
-    scores: list[Score]
+    added: tuple[AddedEffect, ...]
+    """The effects, in the order in which they were added."""
+    fits: Fits
+    """Fits with them in the model."""
+    log_evidence: float
+    """Evidence [nat], up to a constant."""
+    before: "Hypothesis | None" = None
+    """Hypothesis with all but the last effect; None without effects."""
+    scores: list[Score] = field(default_factory=list)
     """Scores of all other effects, filled in when they are computed."""
 
+    @property
+    def fitted(self) -> Fitted:
+        """Return the fit with errors of the likeliest size."""
+        return self.fits.likeliest
 
-def fitted_hypotheses(
-    problem: Problem, context: FitContext, accepted: list[Hypothesis], used: set[int], log: Callable[[str], None]
-) -> list[Hypothesis]:
-    """Return the likeliest effects, fitted, the best first; only those above `MIN_LOG_BAYES_FACTOR`."""
-    found = scores(problem, context.fitted)
-    context.scores.extend(found)
-    log("scores: " + ", ".join(f"{one.name} {one.log_bayes_factor:.1f}" for one in found[:6]))
-    hypotheses = [_fitted(problem, context, one, accepted, used) for one in _likely(problem, found)]
-    for one in hypotheses:
-        log(f"{one.effect.name}: {one.log_bayes_factor:.1f} nat, theta {np.array2string(one.theta, precision=4)}")
-    hypotheses = [one for one in hypotheses if one.log_bayes_factor > MIN_LOG_BAYES_FACTOR and np.any(one.theta != 0)]
-    return sorted(hypotheses, key=lambda one: (not one.sensible, -one.log_bayes_factor))
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the effects."""
+        return tuple(one.effect.name for one in self.added)
+
+    @property
+    def evidence(self) -> HypothesisEvidence:
+        """Return the evidence for a verdict."""
+        sites = int(np.prod([one.effect.sites for one in self.added]))
+        larger = self.fitted.problem.scales.larger
+        return HypothesisEvidence(effects=self.names, log_evidence=self.log_evidence, sites=sites, larger_errors=larger)
+
+    def theta(self, one: AddedEffect) -> np.ndarray:
+        """Return the parameters of one of its effects."""
+        return self.fitted.point.theta[one.at]
+
+    @property
+    def path(self) -> "list[Hypothesis]":
+        """Return the hypotheses that it was reached through, the one without effects first."""
+        return [*([] if self.before is None else self.before.path), self]
 
 
-def _likely(problem: Problem, found: list[Score]) -> list[Score]:
-    """Return the scores of effects to fit: the likeliest, and close ones that the first is often confused with."""
-    entering = [one for one in found if one.log_bayes_factor > MIN_LOG_BAYES_FACTOR]
+def hypothesis_of(fits: Fits, added: tuple[AddedEffect, ...] = (), before: Hypothesis | None = None) -> Hypothesis:
+    """Return fits as a hypothesis."""
+    return Hypothesis(added=added, fits=fits, log_evidence=log_model_evidence(fits.likeliest), before=before)
+
+
+def search(declared: Hypothesis, observed: ObservedStates, used: set[int], log: Log) -> list[Hypothesis]:
+    """Return all hypotheses that were fitted, the declared model first.
+
+    Args:
+        declared: the fit without effects.
+        observed: gives starts of fits.
+        used: parts that are fitted to.
+        log: receives progress messages.
+    """
+    library = len(declared.fitted.problem.sheet.library)
+    found = {frozenset[str](): declared}
+
+    def posterior(one: Hypothesis) -> float:
+        return log_posterior(one.evidence, library)
+
+    beam = [declared]
+    for _ in range(MAX_EFFECTS):
+        best = max(map(posterior, found.values()))
+        new = list[Hypothesis]()
+        for one in (one for one in beam if posterior(one) > best - REACH):
+            for score in likely(one, log):
+                key = frozenset((*one.names, score.name))
+                if key not in found:
+                    found[key] = added_to(one, score, observed, used, log)
+                    new.append(found[key])
+        beam = sorted(new, key=posterior, reverse=True)[:BEAM]
+        if not beam or posterior(beam[0]) < best:
+            break
+    while len((last := max(found.values(), key=posterior)).added) > 1:
+        for one in last.added:
+            key = frozenset(last.names) - {one.effect.name}
+            if key not in found:
+                found[key] = left_out(last, one, used, log)
+        if max(found.values(), key=posterior) is last:
+            break
+    return list(found.values())
+
+
+def likely(one: Hypothesis, log: Log) -> list[Score]:
+    """Return the scores of the effects to add to a hypothesis: the likeliest, and close ones often confused with it."""
+    found = scores(one.fits.assumed)
+    one.scores.extend(found)
+    log(f"scores beside {_title(one.names)}: " + ", ".join(f"{s.name} {s.log_bayes_factor:.1f}" for s in found[:6]))
+    entering = [score for score in found if score.log_bayes_factor > MIN_SCORE]
     if not entering:
         return []
-    first = entering[0]
-    confused = problem.sheet.effect(first.name).confounded_with
-    near = [one for one in entering[N_FITTED:] if one.log_bayes_factor > COMPARED_SHARE * first.log_bayes_factor]
-    return entering[:N_FITTED] + [one for one in near if one.name in confused]
+    confused = one.fitted.problem.sheet.effect(entering[0].name).confounded_with
+    limit = COMPARED_SHARE * entering[0].log_bayes_factor
+    near = [score for score in entering[N_FITTED:] if score.log_bayes_factor > limit]
+    return entering[:N_FITTED] + [score for score in near if score.name in confused]
 
 
-def refined(problem: Problem, hypothesis: Hypothesis, used: set[int], log: Callable[[str], None]) -> Hypothesis:
-    """Return a hypothesis with its unexplained residual, held-out predictions and jackknife errors."""
-    unexplained = unexplained_residual(problem, hypothesis.fitted)
-    fits = leave_one_out(problem, hypothesis.fitted, used)
-    folds = held_out(problem, fits)
-    thetas = [one.point.theta[hypothesis.fitted.named] for one in fits.values()]
-    sds = np.maximum(hypothesis.sds, jackknife_sd(thetas, len(hypothesis.sds)))
-    result = replace(hypothesis, unexplained=unexplained, folds=folds, sds=sds)
-    predicts = f", predicts held-out parts to {1e3 * result.held_out_rms:.2f} mm" if result.folds else ""
-    log(f"{hypothesis.effect.name}: unexplained residual {unexplained.gain:.1f} nat{predicts}")
+def added_to(before: Hypothesis, score: Score, observed: ObservedStates, used: set[int], log: Log) -> Hypothesis:
+    """Return a hypothesis with one more effect, fitted."""
+    last = before.fits.assumed
+    problem = last.problem
+    effect = problem.sheet.effect(score.name)
+    one = AddedEffect(effect=effect, score=score, at=problem.sheet.place(effect.name, score.site))
+    named = np.append(last.named, one.at).astype(int)
+    begun = stepped(last, one.at, score) if score.began is None else score.began
+    fits = fit(problem, named, [begun, *observed.starts(named)], used, before=last)
+    result = hypothesis_of(fits, (*before.added, one), before)
+    _report(result, log)
     return result
 
 
-def reported_sd(problem: Problem, hypothesis: Hypothesis) -> np.ndarray:
-    """Return the standard deviation that is reported for an effect's parameters.
-
-    The model's errors are partly the same in all grasps, and do not average out over them: so it is that of one part
-    alone. The prior of the nuisance parameter of the same name is added, which may have either sign.
-    """
-    own = dict(zip(problem.own.tolist(), problem.own_sd.tolist(), strict=True))
-    alone = np.sqrt(max(len(hypothesis.folds or []), 1)) * hypothesis.sd
-    return np.hypot(alone, [own.get(k, 0.0) for k in hypothesis.at.tolist()])
-
-
-def refitted(problem: Problem, hypothesis: Hypothesis, fitted: Fitted) -> Hypothesis:
-    """Return the same effect in another fit, without unexplained residual and held-out predictions yet."""
-    return replace(hypothesis, fitted=fitted, sds=occam(problem, fitted)[1], unexplained=None, folds=None)
+def left_out(last: Hypothesis, one: AddedEffect, used: set[int], log: Log) -> Hypothesis:
+    """Return a hypothesis without one of its effects, fitted again."""
+    begun = last.fits.assumed
+    named = begun.named[~np.isin(begun.named, one.at)]
+    fits = fit(begun.problem, named, [moved(begun, one.at, np.zeros(len(one.at)))], used)
+    result = hypothesis_of(fits, tuple(other for other in last.added if other is not one), last.path[0])
+    _report(result, log)
+    return result
 
 
-def _fitted(
-    problem: Problem, context: FitContext, score: Score, accepted: list[Hypothesis], used: set[int]
-) -> Hypothesis:
-    effect = problem.sheet.effect(score.name)
-    at = problem.sheet.place(effect.name, score.site)
-    named = np.concatenate([*(one.at for one in accepted), at])
-    before = context.fitted
-    point = _stepped(problem, before, effect, at, score) if score.began is None else score.began
-    fitted = fit(problem, named.astype(int), point, used)
-    return Hypothesis(
-        score=score,
-        effect=effect,
-        fitted=fitted,
-        log_bayes_factor=bayes_factor(problem, fitted, before, effect.sites)[1],
-        at=at,
-        sds=occam(problem, fitted)[1],
-    )
+def _report(one: Hypothesis, log: Log) -> None:
+    scales = ", ".join(f"{value:.2g}" for value in one.fitted.problem.scales.values)
+    sizes = "; ".join(np.array2string(one.theta(added), precision=4) for added in one.added)
+    log(f"{_title(one.names)}: ln Z {one.log_evidence:.1f}, theta {sizes}, variances {scales}")
 
 
-def _stepped(problem: Problem, before: Fitted, effect: Effect, at: np.ndarray, score: Score) -> Point:
-    """Return the point after a linear step of an effect from a fit without it; that fit's if the step costs more."""
-    limit = MAX_START_SDS * problem.prior_sd[at]
-    step = np.clip(before.point.theta[at] + score.theta, np.maximum(problem.lower_bounds(at), -limit), limit)
-    point = moved(problem, before, at, step)
-    return before.point if cost_under(problem, before.weights, point) > before.cost else point
+def _title(names: tuple[str, ...]) -> str:
+    return " and ".join(names) or "nothing"
 
 
-def leave_one_out(problem: Problem, fitted: Fitted, used: set[int]) -> dict[int, Fitted]:
+def leave_one_out(fitted: Fitted, used: set[int]) -> dict[int, Fitted]:
     """Return a fit without each part; empty if there are fewer than two."""
-    return parallel_map(lambda part: without(problem, fitted, part), sorted(used) if len(used) > 1 else [])
-
-
-def jackknife_sd(thetas: list[np.ndarray], size: int) -> np.ndarray:
-    """Return the jackknife standard error of parameters from fits without one part each; zero if there is none.
-
-    Grasps disagree by more than their noise where the model is wrong in other ways too [Miller 1974,
-    doi:10.1093/biomet/61.1.1]. Each fit is one step from that to all parts, so that this is a lower bound.
-    """
-    if not thetas:
-        return np.zeros(size)
-    deviation = np.array(thetas) - np.mean(thetas, axis=0)
-    return np.sqrt((len(thetas) - 1) / len(thetas) * np.sum(deviation**2, axis=0))
+    return parallel_map(lambda part: without(fitted, part), sorted(used) if len(used) > 1 else [])

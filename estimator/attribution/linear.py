@@ -75,16 +75,33 @@ def misfit(
     sheet: PredictedSheet,
     likelihood: FrameLikelihood,
     theta: Float[Array, " p"],
+    s: Float[Array, " n"],
     frame: ClosedFrame,
     context: FrameContext,
     x: Float[Array, "n 3"],
 ) -> WeightedResiduals:
-    """Return the weighted residuals of another prediction x of the same frame."""
+    """Return the weighted residuals of another prediction x of the same frame.
+
+    Forces that do not balance there count too: where a material is unstable, no equilibrium is found.
+    """
     model = sheet.model(theta, context, frame.displacement)
-    e = likelihood.forces(frame.y - look(model, x))[:, :, None]
+    unbalanced = sheet.balance.with_energy(model.energy).unbalanced(x, s)
+    e = (likelihood.forces(frame.y - look(model, x)) + unbalanced)[:, :, None]
     products = likelihood.dot(jnp.concatenate([likelihood.fields, e], axis=2), e, likelihood.whitened(e))[:, 0]
     tool = tool_residual(sheet, model, theta, frame, context, x) / tool_sd(frame)
     return WeightedResiduals(squared=products[-1], fields=products[:-1], tool=tool)
+
+
+def parameter_forces(
+    sheet: PredictedSheet,
+    likelihood: FrameLikelihood,
+    theta: Float[Array, " p"],
+    directions: Float[Array, "p d"],
+    frame: ClosedFrame,
+    context: FrameContext,
+) -> Float[Array, "n 3 d"]:
+    """Return G, the forces by which a change of the parameters moves what is observed, at the likelihood's state."""
+    return _columns(sheet, likelihood, theta, directions, frame, context)[0][:, :, :-1]
 
 
 @eqx.filter_jit

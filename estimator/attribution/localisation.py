@@ -6,14 +6,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import spearmanr
 
-from .fit import Fitted
+from .gauss_newton import Fitted
 from .problem import Problem
 
 MIN_PAIRS = 3
 """Smallest number of pairs with a rank correlation: of two it is always 1 or -1."""
 
 
-def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
+def localisation(fitted: Fitted) -> dict[str, Any]:
     """Return a fit's residuals by frame and by particle, and rank correlations with possible causes.
 
     Returns:
@@ -21,6 +21,7 @@ def localisation(problem: Problem, fitted: Fitted) -> dict[str, Any]:
         null where never observed, P(attached) and whether that is more than a half; rank_correlation: Spearman's
         correlation of the residual's length, over frames and particles, with each regressor.
     """
+    problem = fitted.problem
     frames, rest = list(fitted.equations), np.asarray(problem.history.rest)
     residual = np.full((len(frames), len(rest), 3), np.nan)
     for row, k in zip(residual, frames, strict=True):

@@ -20,12 +20,21 @@ def reduced(problem: Problem, equations: dict[int, NormalEquations], d: int) -> 
         whole = np.sum([np.asarray(equations[k].square) for k in frames], axis=0)
         rows = np.array([np.asarray(equations[k].tool) for k in frames])
         n = len(whole) - rows.shape[2]
-        whole[n:, n:] += less_offset(rows, problem.history.frames[frames[0]].frame)
+        whole[n:, n:] += less_offset(rows, problem.history.frames[frames[0]].frame) / problem.scales.tool
         left = np.r_[0 : n + d, len(whole) - 1]
         middle = whole[FIELDS, FIELDS] + np.eye(N_FIELDS) / problem.amplitude**2
         beside = whole[FIELDS][:, left]
         total = total + whole[np.ix_(left, left)] - beside.T @ np.linalg.solve(middle, beside)
     return np.asarray(total)
+
+
+def tool_sum(problem: Problem, equations: dict[int, NormalEquations]) -> float:
+    """Return the sum of the tool's squared residuals over all frames, over the assumed variances."""
+    total = 0.0
+    for frames in problem.by_part(equations).values():
+        rows = np.array([np.asarray(equations[k].tool)[:, -1:] for k in frames])
+        total += float(less_offset(rows, problem.history.frames[frames[0]].frame)[0, 0])
+    return total
 
 
 def without_stiffnesses(

@@ -1,7 +1,7 @@
 """The problem that effects are fitted to: the sheet, its frames, the noise, and the priors."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import numpy as np
@@ -18,6 +18,7 @@ from ..filter_builder import force_balance
 from ..physics.mesh import SheetMesh
 from .dataset import Dataset
 from .grasped_frames import Timed
+from .noise_scales import NoiseScales
 from .sheet import PredictedSheet
 
 NUISANCE = {
@@ -30,11 +31,11 @@ NUISANCE = {
 }
 """Nuisance parameters, which may differ a little from 0 in any sheet: prior standard deviations in the effects'
 units."""
-FORCE_VARIANCE = 0.04
+FORCE_VARIANCE = 0.012
 """Share of the filter's force variance that remains once smooth force fields hold what is the same in all frames of a
 grasp. Measured: the likeliest on recordings of the reference with nothing undeclared."""
-AMPLITUDE = 0.2
-"""Standard deviation of the smooth force fields [force errors]; the likeliest on the same recordings."""
+AMPLITUDE = 0.365
+"""Assumed sd of the smooth force fields [assumed force errors]; the likeliest on the same recordings."""
 SHEET_STRENGTH = 1e9
 """Attached neighbours that the whole sheet is worth [particles]; see `PriorConfig.sheet_strength`. Here all attachments
 resemble each other, as they did when the limits of the decisions were chosen."""
@@ -58,8 +59,13 @@ class Problem:
     """Nuisance parameters, which are free in all fits."""
     own_sd: Float[np.ndarray, " own"]
     """Prior standard deviations of the nuisance parameters."""
-    amplitude: float = AMPLITUDE
-    """Standard deviation of the smooth force fields [force errors]."""
+    scales: NoiseScales = field(default_factory=NoiseScales)
+    """Sizes of the errors."""
+
+    @property
+    def amplitude(self) -> float:
+        """Return the standard deviation of the smooth force fields [force errors]."""
+        return AMPLITUDE * (self.scales.fields / self.scales.force) ** 0.5
 
     @classmethod
     def build(cls, dataset: Dataset, library: tuple[Effect, ...]) -> "Problem":
@@ -84,10 +90,10 @@ class Problem:
             own_sd=np.concatenate([[], *(np.asarray(sd) for sd in own.values())]),
         )
 
-    def inflated(self, variance: float, amplitude: float) -> "Problem":
-        """Return the problem with the forces' variance multiplied, and another amplitude of the smooth fields."""
-        sheet = eqx.tree_at(lambda one: one.balance, self.sheet, self.sheet.balance.inflated(variance))
-        return replace(self, sheet=sheet, amplitude=amplitude)
+    def with_scales(self, scales: NoiseScales) -> "Problem":
+        """Return the problem with other sizes of the errors."""
+        balance = self.sheet.balance.inflated(scales.force / self.scales.force)
+        return replace(self, sheet=eqx.tree_at(lambda one: one.balance, self.sheet, balance), scales=scales)
 
     def frames(self, parts: Iterable[int]) -> list[int]:
         """Return the frames of some parts."""

@@ -24,10 +24,9 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import minimize
 
 from ..map_rows import map_rows
-from .fit import Fitted
+from .gauss_newton import Fitted
 from .grasped_frames import Timed
 from .held_out import from_rest, noise_variance
-from .problem import Problem
 
 TERMS = ("offset", "share", "drift", "walk", "white")
 """Names of the variances."""
@@ -98,11 +97,12 @@ class FittedRemainder:
         )
 
 
-def remainder_of_fit(problem: Problem, fitted: Fitted) -> FittedRemainder:
+def remainder_of_fit(fitted: Fitted) -> FittedRemainder:
     """Return the remainder of a fit, given the frames that it was fitted to.
 
     These are predicted from the tool's reports, as held-out ones are.
     """
+    problem = fitted.problem
     frames, known = problem.history.frames, sorted(fitted.equations)
     predicted = from_rest(problem, fitted.point, known, by_tool=True)
     return remainder(

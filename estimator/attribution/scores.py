@@ -16,15 +16,15 @@ from scipy.stats import chi2
 
 from ..belief.gaussian_information import GaussianInformation
 from ..effects.effect import Effect
-from .every_frame import cost_under, directions, linearised
-from .fit import Fitted, fit, gains_over, moved
+from .every_frame import directions, linearised, misfit_under
+from .gauss_newton import Fitted, gauss_newton, linearise_at, moved
 from .normal_equations import reduced, without_stiffnesses
-from .problem import Point, Problem
+from .problem import Point
 
 INITIAL_GUESS_STEPS = 2
 """Gauss-Newton steps of a fit from an initial guess of an effect."""
-MAX_START_COST = 4.0
-"""Largest cost at an initial guess with which the fit is tried [costs without the effect]."""
+MAX_START_MISFIT = 4.0
+"""Largest misfit at an initial guess with which the fit is tried [misfits without the effect]."""
 SINGULAR = 1e-9
 """Share of the trace that is added to an information matrix before it is inverted: some directions have none."""
 MIN_TRACE = 1e-30
@@ -52,52 +52,41 @@ class Score:
     """Share of the information about it that is left after marginalising, at 0, in the worst direction."""
 
 
-def scores(problem: Problem, fitted: Fitted) -> list[Score]:
+def scores(fitted: Fitted) -> list[Score]:
     """Return the scores of all effects that are not in the fit, the likeliest first."""
-    n, every = len(fitted.site_precision), directions(problem, np.arange(problem.sheet.size))
-    equations = linearised(problem, fitted.around, fitted.weights, every)
+    problem, n = fitted.problem, len(fitted.site_precision)
+    equations = linearised(problem, fitted.point, fitted.weights, directions(problem, np.arange(problem.sheet.size)))
     square = reduced(problem, equations, problem.sheet.size)
     left, whole = without_stiffnesses(square, fitted.site_precision), square[n:, n:]
     found = [
-        _over_sites([_score(problem, fitted, effect, site, left, whole) for site in range(effect.sites)])
+        _over_sites([_score(fitted, effect, site, left, whole) for site in range(effect.sites)])
         for effect in problem.sheet.library
         if not np.isin(problem.sheet.place(effect.name), fitted.named).any()
     ]
-    return sorted((_from_initial_guesses(problem, fitted, one) for one in found), key=lambda one: -one.log_bayes_factor)
+    return sorted((_from_initial_guesses(fitted, one) for one in found), key=lambda one: -one.log_bayes_factor)
 
 
-def occam(problem: Problem, fitted: Fitted) -> tuple[float, Float[np.ndarray, " named"]]:
-    """Return ln |I + Theta V| / 2 of the effects' parameters in a fit, and their standard deviations."""
+def parameters_sd(fitted: Fitted) -> Float[np.ndarray, " named"]:
+    """Return the standard deviations of the effects' parameters in a fit, with everything else marginalised."""
     if not len(fitted.named):
-        return 0.0, np.zeros(0)
-    d, sd = len(fitted.named), problem.sd(fitted.named)
+        return np.zeros(0)
+    d, sd = len(fitted.named), fitted.problem.sd(fitted.named)
     free = without_stiffnesses(fitted.square, fitted.site_precision).named(named=d, nuisance=len(sd) - d)
     V = free.with_independent("nuisance", sd[d:] ** -2).marginal("named").precision
     scaled = GaussianInformation(precision=V * np.outer(sd[:d], sd[:d]) + np.eye(d), shift=np.zeros(d))
-    return 0.5 * float(scaled.log_det()), sd[:d] * np.sqrt(np.asarray(scaled.variances()))
-
-
-def bayes_factor(problem: Problem, better: Fitted, plain: Fitted, sites: int) -> tuple[float, float]:
-    """Return the log likelihood ratio of two fits, and the log Bayes factor [nat].
-
-    The latter has the Occam factor of the parameters, and of the choice among `sites`. Both are minus infinity for a
-    fit whose cost is not finite.
-    """
-    if not np.isfinite(better.cost):
-        return -np.inf, -np.inf
-    likelier = min(gains_over(problem, better, plain))
-    return likelier, float(likelier - (occam(problem, better)[0] - occam(problem, plain)[0]) - np.log(sites))
+    return sd[:d] * np.sqrt(np.asarray(scaled.variances()))
 
 
 def _score(
-    problem: Problem, fitted: Fitted, effect: Effect, site: int, left: GaussianInformation, whole: np.ndarray
+    fitted: Fitted, effect: Effect, site: int, left: GaussianInformation, whole: Float[np.ndarray, "p p"]
 ) -> Score:
     """Return the score at one site, from the information with s marginalised, and the products of all columns."""
+    problem = fitted.problem
     mine = problem.sheet.place(effect.name, site)
     others = ~np.isin(fitted.free, mine)
     rest, sd_rest = fitted.free[others], problem.sd(fitted.named)[others]
     joint = left.restricted(effect=mine, nuisance=rest)
-    joint = joint.with_independent("nuisance", sd_rest**-2, -fitted.around.theta[rest] / sd_rest**2)
+    joint = joint.with_independent("nuisance", sd_rest**-2, -fitted.point.theta[rest] / sd_rest**2)
     own, sd, eye = joint.marginal("effect"), problem.prior_sd[mine], np.eye(len(mine))
     unit, scaled = own.precision * np.outer(sd, sd), own.shift * sd
     posterior = GaussianInformation(precision=unit + eye, shift=scaled)
@@ -118,21 +107,23 @@ def _score(
     )
 
 
-def _from_initial_guesses(problem: Problem, fitted: Fitted, score: Score) -> Score:
+def _from_initial_guesses(fitted: Fitted, score: Score) -> Score:
     """Return an effect's score, or that of a few steps from its best initial guess, if that is larger."""
+    problem = fitted.problem
     effect = problem.sheet.effect(score.name)
     if not effect.initial_guesses:
         return score
     at = problem.sheet.place(effect.name, score.site)
-    parts = {problem.history.frames[k].part for k in fitted.equations}
-    starts = [moved(problem, fitted, at, np.array(guess)) for guess in effect.initial_guesses]
-    costs = [cost_under(problem, fitted.weights, point) for point in starts]
-    if min(costs) > MAX_START_COST * fitted.cost:
+    starts = [moved(fitted, at, np.array(guess)) for guess in effect.initial_guesses]
+    misfits = [misfit_under(problem, fitted.weights, point) for point in starts]
+    if min(misfits) > MAX_START_MISFIT * fitted.square[-1, -1]:
         return score
-    best = starts[int(np.argmin(costs))]
-    found = fit(problem, np.append(fitted.named, at), best, parts, passes=INITIAL_GUESS_STEPS)
-    likelier, gain = bayes_factor(problem, found, fitted, effect.sites)
-    if gain <= score.log_bayes_factor:
+    begun = linearise_at(problem, np.append(fitted.named, at), starts[int(np.argmin(misfits))], list(fitted.equations))
+    found = gauss_newton(begun, passes=INITIAL_GUESS_STEPS)
+    likelier = (fitted.cost - found.cost) / 2
+    sd = parameters_sd(found)[-len(at) :] / problem.prior_sd[at]
+    gain = likelier + float(np.sum(np.log(sd)))
+    if not gain > score.log_bayes_factor:
         return score
     return replace(
         score,

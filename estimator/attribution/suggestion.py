@@ -21,8 +21,8 @@ from ..physics.mesh import farthest_points
 from ..planning.information_config import SLANTED, UP, InformationPolicyConfig
 from .close_loop import Closed
 from .dataset import Dataset
-from .every_frame import cost_under, weighed
-from .fit import Fitted
+from .every_frame import misfit_under, weighed
+from .gauss_newton import Fitted
 from .grasped_frames import ClosedFrame, Timed
 from .held_out import from_rest
 from .problem import Point, Problem
@@ -64,11 +64,10 @@ def suggest(closed: Closed, dataset: Dataset, *, log: Callable[[str], None] = la
         dataset: what it was closed over.
         log: receives progress messages.
     """
-    open_ = [[best, *rivals] for best, rivals in zip(closed.accepted, closed.rivals, strict=True) if rivals]
-    if not open_:
+    if not closed.rivals:
         return None
-    hypotheses = open_[-1]
-    fits, names = [one.fitted for one in hypotheses], tuple(one.effect.name for one in hypotheses)
+    hypotheses = [closed.final, *closed.rivals]
+    fits, names = [one.fitted for one in hypotheses], tuple(" + ".join(one.names) for one in hypotheses)
     log(f"searching for a pull that distinguishes {', '.join(names)}")
     rest, length, gap, radius = dataset.estimator.sheet.rest, *_typical_grasp(dataset)
     places = farthest_points(rest, InformationPolicyConfig().n_places).tolist()
@@ -123,9 +122,9 @@ def _at_rest(problem: Problem) -> Float[np.ndarray, "frames n 3"]:
 
 def _cost(problem: Problem, fitted: Fitted, frames: list[Timed]) -> float:
     """Return the negative log likelihood of frames under a fit, without constants [nat]."""
-    problem = _with_frames(problem, frames)
+    problem = _with_frames(problem.with_scales(fitted.problem.scales), frames)
     point = _predicted(problem, fitted, by_tool=False)
-    return 0.5 * cost_under(problem, weighed(problem, point, list(range(len(frames)))), point)
+    return 0.5 * misfit_under(problem, weighed(problem, point, list(range(len(frames)))), point)
 
 
 def _with_frames(problem: Problem, frames: list[Timed]) -> Problem:

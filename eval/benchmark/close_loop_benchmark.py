@@ -143,14 +143,14 @@ def _times(recording: Recording, library: tuple[Effect, ...], log: Callable[[str
     closed = measure("close", close)
     for seconds, line in clock.phases:
         log(f"    {seconds:7.2f} s until: {' '.join(line.split())}")
-    problem, fitted = closed.problem, closed.contexts[0].fitted
+    problem, fitted = closed.problem, closed.declared.fitted
     parts = list(dict.fromkeys(one.part for one in dataset.frames))
-    measure("scores", lambda: scores(problem, fitted))
-    measure("one_hypothesis", lambda: fit(problem, problem.sheet.place(EFFECT), fitted.point, set(parts[:-1])))
-    measure("held_out", lambda: predict_held_out(problem, fitted, parts[-1]))
-    measure("remainder", lambda: remainder_of_fit(problem, fitted))
+    measure("scores", lambda: scores(fitted))
+    measure("one_hypothesis", lambda: fit(problem, problem.sheet.place(EFFECT), [fitted.point], set(parts[:-1])))
+    measure("held_out", lambda: predict_held_out(fitted, parts[-1]))
+    measure("remainder", lambda: remainder_of_fit(fitted))
     whole = float(metrics["read_and_filter_s"]["value"]) + float(metrics["close_s"]["value"])
-    named = ", ".join(one.effect.name for one in closed.accepted)
+    named = ", ".join(closed.final.names)
     return {
         "particles": {"value": len(dataset.estimator.sheet.rest), "unit": "count"},
         "frames": {"value": len(dataset.frames), "unit": "count"},

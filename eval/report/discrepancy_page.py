@@ -17,8 +17,8 @@ from jiggle_mj.recording.output_files import write_text
 
 from ..metrics.flat_map import plane_of
 
-SHOWN_EFFECTS = 12
-"""Most effects in the picture of scores; more names do not fit its height."""
+SHOWN_HYPOTHESES, LISTED = 10, 3
+"""Most hypotheses in the picture of probabilities, whose height holds no more names, and in the sentence."""
 BEFORE, AFTER, RING = "#d55e00", "#0072b2", "#e8000b"
 """Colours of the figures before and after, and of the ring around an attached particle."""
 TIMES, LOCALISED = ("before", "after"), ("localisation", "localisation_after")
@@ -47,7 +47,10 @@ VERDICTS = {
 
 def story(found: Mapping[str, Any]) -> list[str]:
     """Return what was found, in sentences, from the content of discrepancy.json."""
-    sentences = [VERDICTS[found["verdict"]]]
+    first = VERDICTS[found["verdict"]]
+    if found["verdict"] == "ambiguous" and not found["ambiguous_with"]:
+        first = "An effect is found, but these frames do not exclude that nothing is missing."
+    sentences = [first, _posterior_sentence(found["posterior"])]
     for effect in found["effects"]:
         sizes = ", ".join(_size(*each) for each in zip(effect["theta"], effect["sd"], effect["units"], strict=True))
         sentences.append(f"Added: {effect['name']} ({sizes}), log Bayes factor {effect['log_bayes_factor']:.0f}.")
@@ -76,6 +79,18 @@ def story(found: Mapping[str, Any]) -> list[str]:
             "another shape there than when the jaws closed on it, so its tracking is wrong there."
         )
     return sentences
+
+
+def _posterior_sentence(posterior: list[Mapping[str, Any]]) -> str:
+    """Return the probabilities of the likeliest hypotheses, and whether their errors are larger than usual."""
+    shares = [f"{_title(one)} {one['probability']:.2g}" for one in posterior[:LISTED]]
+    larger = posterior[0]["larger_errors"]
+    why = f" Its errors are larger than usual with a probability of {larger:.2g}: something without a name is missing."
+    return f"Probability of what is missing: {', '.join(shares)}.{why if larger > 0.5 else ''}"
+
+
+def _title(hypothesis: Mapping[str, Any]) -> str:
+    return " and ".join(hypothesis["effects"]) or "nothing"
 
 
 def _held_out_sentences(found: Mapping[str, Any]) -> list[str]:
@@ -168,7 +183,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         subplot_titles=(
             "mean residual on the sheet, before [mm]; ringed: detected attached",
             "after [mm]",
-            "log Bayes factor, one step from the fit [nat]",
+            "probability of what is missing",
             "rank correlation of the residual, before and after",
             "residual of each frame [mm]; dotted: predicted from the tool's reports alone",
             "held-out parts, then the part that chose no effect [mm]",
@@ -195,9 +210,9 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         dots = go.Scatter(x=1e3 * flat[:, 0], y=1e3 * flat[:, 1], mode="markers", marker=marker, showlegend=False)
         figure.add_trace(dots, row=1, col=column)
         figure.update_yaxes(scaleanchor=f"x{'' if column == 1 else column}", row=1, col=column)
-    likely = found["scores"][:SHOWN_EFFECTS][::-1]
-    bars = go.Bar(x=[score["log_bayes_factor"] for score in likely], y=[score["name"] for score in likely],
-                  orientation="h", marker={"color": BEFORE}, showlegend=False)  # fmt: skip
+    likely = found["posterior"][:SHOWN_HYPOTHESES][::-1]
+    bars = go.Bar(x=[one["probability"] for one in likely], y=[_title(one) for one in likely],
+                  orientation="h", marker={"color": AFTER}, showlegend=False)  # fmt: skip
     figure.add_trace(bars, row=2, col=1)
     for when, key, colour in zip(TIMES, LOCALISED, (BEFORE, AFTER), strict=True):
         known = {name: value for name, value in found[key]["correlates_with"].items() if value is not None}

@@ -109,7 +109,7 @@ def close_loop(
     added = corrected_parameters(closed, declaration)
     write_corrected(directory, added, declaration, name=name)
     write()
-    attached = {"before": closed.contexts[0].fitted.attached, "after": closed.final.attached}
+    attached = {"before": closed.declared.fitted.attached, "after": closed.final.fitted.attached}
     if added and closed.verdict not in UNEXPLAINED:
         log("estimating under the corrected model")
         corrected = corrected_declaration(added, declaration)

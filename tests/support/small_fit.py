@@ -5,7 +5,7 @@ from functools import cache
 import jax.numpy as jnp
 import numpy as np
 
-from jiggle_mj.estimator.attribution.fit import Fitted
+from jiggle_mj.estimator.attribution.gauss_newton import Fitted
 from jiggle_mj.estimator.attribution.grasped_frames import ClosedFrame, Timed
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.attribution.sheet import PredictedSheet
@@ -45,8 +45,10 @@ def small_problem() -> Problem:
     )
 
 
-def small_fit(*, theta: np.ndarray | None = None, named: np.ndarray | None = None, cost: float = 0.0) -> Fitted:
-    """Return a fit of given parameters and cost, with one particle and no frames."""
+def small_fit(
+    *, theta: np.ndarray | None = None, named: np.ndarray | None = None, log_likelihood: float = 0.0
+) -> Fitted:
+    """Return a fit of given parameters, with one particle and no frames."""
     theta = np.zeros(1) if theta is None else theta
     named = np.arange(len(theta)) if named is None else named
     point = Point(theta=theta, s=np.zeros(1), states=np.zeros((0, 1, 3)), seen=np.zeros((0, 1, 3)))
@@ -60,13 +62,13 @@ def small_fit(*, theta: np.ndarray | None = None, named: np.ndarray | None = Non
         convergence=Convergence.CONVERGED.code,
     )
     return Fitted(
+        problem=small_problem(),
         point=point,
-        around=point,
         named=named,
         free=named,
         square=np.zeros((len(named) + 2, len(named) + 2)),
         equations={},
         weights={},
         summary=summary,
-        cost=cost,
+        log_likelihood=0.0,
     )

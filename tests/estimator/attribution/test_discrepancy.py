@@ -34,6 +34,16 @@ def test_the_file_and_the_page_hold_the_result(light, tmp_path):
     assert f"Added: {found['effects'][0]['name']}" in (tmp_path / "a.html").read_text()
 
 
+def test_the_probabilities_of_hypotheses_come_first(light):
+    _, found, _ = light
+    shares = [one["probability"] for one in found["posterior"]]
+    assert shares == sorted(shares, reverse=True) and sum(shares) == pytest.approx(1)
+    assert found["posterior"][0]["effects"] == [one["name"] for one in found["effects"]]
+    assert story(found)[1].startswith(f"Probability of what is missing: {found['effects'][0]['name']}")
+    doubtful = found | {"verdict": "ambiguous", "ambiguous_with": []}
+    assert story(doubtful)[0].endswith("do not exclude that nothing is missing.")
+
+
 @pytest.fixture(scope="module")
 def stopped_run(light, tmp_path_factory):
     """Return the folder of a closed loop that was stopped as it began to search for a pull, and its recording."""
@@ -78,10 +88,11 @@ def test_the_corrected_model_holds_the_fitted_effects_within_their_bounds(light,
 
 def test_the_bounds_of_a_parameter_are_those_of_its_site(light):
     drift = next(effect for effect in LIBRARY if effect.name == "camera_drift")
-    score = dataclasses.replace(light[0].accepted[0].score, name="camera_drift", site=2)
-    at = np.arange(len(drift.prior_sd))
-    slow = dataclasses.replace(light[0].accepted[0], effect=drift, score=score, at=at)
-    found = corrected_parameters(dataclasses.replace(light[0], accepted=[slow]), DECLARATION)["camera_drift.2"]
+    (one,) = light[0].final.added
+    score = dataclasses.replace(one.score, name="camera_drift", site=2)
+    slow = dataclasses.replace(one, effect=drift, score=score, at=np.arange(len(drift.prior_sd)))
+    final = dataclasses.replace(light[0].final, added=(slow,))
+    found = corrected_parameters(dataclasses.replace(light[0], final=final), DECLARATION)["camera_drift.2"]
     assert found.max_value[0] == pytest.approx(4 * DRIFT_RATES[2])
 
 
@@ -111,7 +122,7 @@ def test_the_suggested_pull_distinguishes_better_than_the_first_lift(light):
     with jax.enable_x64(True), one_thread():
         found = suggest(closed, dataset)
         assert found is not None and set(found.between) == {"gravity", "stretch"}
-        fits = [one.fitted for one in (closed.accepted[0], *closed.rivals[0])]
+        fits = [one.fitted for one in (closed.final, *closed.rivals)]
         first = [one for one in dataset.frames if one.grasp == 1][:4]
         assert found.expected > expected_log_bayes_factor(closed.problem, fits, first) > 0
         assert expected_log_bayes_factor(closed.problem, [fits[0], fits[0]], first) == pytest.approx(0, abs=1)

@@ -29,7 +29,7 @@ def dense(likelihood: FrameLikelihood, smooth: np.ndarray) -> float:
 
 
 def test_both_determinants_are_those_of_dense_matrices(light):
-    problem, fitted = light[0].problem, light[0].contexts[0].fitted
+    problem, fitted = light[0].problem, light[0].declared.fitted
     with jax.enable_x64(True), one_thread():
         for k in list(fitted.weights)[::5]:
             fields = jnp.asarray(problem.noise)[:, None, :, None] * jnp.eye(3)[None, :, None, :]

@@ -32,7 +32,7 @@ def test_one_compilation_serves_all_frames(light):
 
 def test_grasps_are_predicted_in_parallel_and_the_frames_of_each_in_order(light):
     """With friction, which depends on the state of the frame before."""
-    problem, point = light[0].problem, light[0].contexts[0].fitted.point
+    problem, point = light[0].problem, light[0].declared.fitted.point
     theta, history = point.theta.copy(), problem.history
     theta[problem.sheet.place("friction")] = 0.5
     with jax.enable_x64(True), one_thread():
@@ -75,7 +75,7 @@ def test_a_moved_camera_shifts_where_the_jaws_closed_too(light):
             problem.sheet, library=tuple(one for one in LIBRARY if one.name == "camera_bias")
         )
         k, shift = 2, jnp.array([1e-3, -2e-3, 3e-3, 0.0, 0.0, 0.0])
-        states = light[0].contexts[0].fitted.point.states
+        states = light[0].declared.fitted.point.states
         frame, context = problem.history.frames[k].frame, problem.history.context(k, states)
         moved = dataclasses.replace(frame, y=frame.y + shift[None, :3], rotated=frame.rotated + shift[None, :3])
         closed = closed_on(camera_sheet, shift, moved, context)

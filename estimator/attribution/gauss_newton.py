@@ -1,0 +1,273 @@
+"""Gauss-Newton steps of stiffnesses and of the parameters of some effects to all predicted equilibria of a recording.
+
+The weights are those of the current state [iteratively reweighted: Green 1984, JRSS B 46:149]. A step is taken if it
+lowers the cost, twice the negative logarithm of likelihood and prior, with the weights and determinants of where it
+leads: so weights that are more tolerant gain nothing. Stiffnesses step to where the belief has them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..belief.attachment_belief import AttachmentBelief
+from ..belief.gaussian_information import GaussianInformation
+from ..filters.implicit import likeliest, quick_summary
+from ..filters.posterior_summary import PosteriorSummary
+from .every_frame import directions, linearised, log_determinants, misfit_under, weighed
+from .frame_likelihood import FrameLikelihood
+from .linear import NormalEquations
+from .normal_equations import reduced
+from .problem import Point, Problem
+from .sheet import predict_all
+
+ATTACHMENT_LOG_ODDS = 2.2
+"""Prior cost of an attachment: the logarithm of nine to one [nat]."""
+MAX_STIFFNESS = 0.98
+"""Largest bounded stiffness."""
+MAX_GAUSS_NEWTON_STEPS = 10
+"""Largest number of Gauss-Newton steps."""
+STEP_SHARES = (1.0, 0.4, 0.15, 0.05)
+"""Shares of a step that are tried."""
+MAX_EFFECT, MAX_NUISANCE = 4.0, 3.0
+"""Largest size of a parameter of an effect, and of a nuisance parameter [prior standard deviations]."""
+MAX_CHANGE = 1.5
+"""Largest change of a parameter in one step [prior standard deviations]."""
+MIN_GAIN = 2.0
+"""Fall of the cost that is worth a step [nat, doubled]."""
+MAX_TRIED = 3
+"""Largest number of candidate points that are tried in a step."""
+FACTOR_PRECISION = 1e-2
+"""Prior precision of a common factor of all s about 1. It decides where no frame shows an attachment."""
+Step = tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
+"""Change of the parameters and of s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """Result of a fit."""
+
+    problem: Problem
+    """What was fitted to, with the noise scales of the fit."""
+    point: Point
+    """Fitted parameters and states."""
+    named: np.ndarray
+    """Parameters of the effects in the model."""
+    free: np.ndarray
+    """All fitted parameters, nuisance parameters included."""
+    square: Float[np.ndarray, "k k"]
+    """Normal equations over s, the free parameters and -1."""
+    equations: dict[int, NormalEquations]
+    """Normal equations of each frame."""
+    weights: dict[int, FrameLikelihood]
+    """Weights of the residuals of each frame."""
+    summary: PosteriorSummary
+    """Posterior of the attachments, with the free parameters marginalised."""
+    log_likelihood: float
+    """Log density of the observations, determinants included [nat], up to a constant of the frames."""
+
+    @property
+    def cost(self) -> float:
+        """Return twice the negative logarithm of likelihood and prior [nat]."""
+        return _cost(self.problem, self.named, self.point, self.log_likelihood)
+
+    @property
+    def belief(self) -> AttachmentBelief:
+        """Return the belief about the attachments."""
+        assert isinstance(self.summary.belief, AttachmentBelief)
+        return self.summary.belief
+
+    @property
+    def site_precision(self) -> Float[np.ndarray, " n"]:
+        """Return the precision that the belief has of each s in addition to the frames' evidence."""
+        return np.asarray(self.belief.site_precision)
+
+    @property
+    def probability(self) -> Float[np.ndarray, " n"]:
+        """Return P(attached) of each particle; one of the likeliest set need not be likely itself."""
+        return np.asarray(self.summary.probability)
+
+    @property
+    def attached(self) -> Bool[np.ndarray, " n"]:
+        """Return which particles are more likely attached than not."""
+        return self.probability > 0.5
+
+
+def start(problem: Problem, theta: np.ndarray, s: np.ndarray, states: np.ndarray, frames: list[int]) -> Point:
+    """Return a point with its predictions."""
+    states, seen = predict_all(problem.sheet, theta, s, problem.history, states, only=frames)
+    return Point(theta=theta, s=s, states=states, seen=seen)
+
+
+def moved(fitted: Fitted, at: np.ndarray, theta: np.ndarray) -> Point:
+    """Return a fit's point with other values of some parameters, and its predictions."""
+    changed = fitted.point.theta.copy()
+    changed[at] = theta
+    return start(fitted.problem, changed, fitted.point.s, fitted.point.states, list(fitted.equations))
+
+
+def gauss_newton(
+    begun: Fitted, *, passes: int = MAX_GAUSS_NEWTON_STEPS, log: Callable[[str], None] = lambda _: None
+) -> Fitted:
+    """Return the fit of parameters and all stiffnesses to the frames of a point, with the noise scales that it has.
+
+    Args:
+        begun: the start, linearised.
+        passes: largest number of Gauss-Newton steps.
+        log: receives progress messages.
+    """
+    now = begun
+    for count in range(passes):
+        if (better := better_point(now, candidate_steps(now))) is None:
+            break
+        before, now = now, linearised_fit(better, now.named)
+        log(f"step {count + 1}: {before.cost / 2:.1f} -> {now.cost / 2:.1f} nat")
+    return now
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weighed:
+    """A point with the weights of the residuals there."""
+
+    problem: Problem
+    """What is fitted to."""
+    point: Point
+    """The point."""
+    weights: dict[int, FrameLikelihood]
+    """Weights of the residuals of each frame."""
+    log_likelihood: float
+    """Log density of the observations [nat], up to a constant of the frames."""
+
+
+def weighed_with(problem: Problem, point: Point, weights: dict[int, FrameLikelihood]) -> Weighed:
+    """Return a point with the weights that it has."""
+    doubled = misfit_under(problem, weights, point) + log_determinants(problem, weights)
+    return Weighed(problem=problem, point=point, weights=weights, log_likelihood=-0.5 * doubled)
+
+
+def linearise_at(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> Fitted:
+    """Return a point as a fit, with weights, normal equations and posterior there."""
+    return linearised_fit(weighed_with(problem, point, weighed(problem, point, frames)), named)
+
+
+def linearised_fit(at: Weighed, named: np.ndarray) -> Fitted:
+    """Return a weighed point as a fit, with normal equations and posterior there."""
+    equations = linearised(at.problem, at.point, at.weights, directions(at.problem, at.problem.free(named)))
+    return fit_at(at, named, equations)
+
+
+def fit_at(at: Weighed, named: np.ndarray, equations: dict[int, NormalEquations]) -> Fitted:
+    """Return a weighed point as a fit, from the normal equations of its frames."""
+    problem, point = at.problem, at.point
+    free, sd = problem.free(named), problem.sd(named)
+    square = reduced(problem, equations, len(free))
+    return Fitted(
+        problem=problem,
+        point=point,
+        named=named,
+        free=free,
+        square=square,
+        equations=equations,
+        weights=at.weights,
+        summary=_summary(problem, square, point, free, sd),
+        log_likelihood=at.log_likelihood,
+    )
+
+
+def better_point(now: Fitted, steps: list[Step]) -> Weighed | None:
+    """Return a point of lower cost; None if none of the likeliest candidates has one.
+
+    The share of a step with the largest predicted gain is tried first. The posterior may have stiffnesses that fit
+    worse; a step of the parameters alone then has the larger gain.
+    """
+    candidates = [_apply(now, step, share) for step in steps for share in STEP_SHARES]
+    gains = np.array([_predicted_gain(now, theta, s) for theta, s in candidates])
+    for k in np.argsort(-gains, kind="stable")[:MAX_TRIED]:
+        if not gains[k] > MIN_GAIN:
+            return None
+        theta, s = candidates[k]
+        point = start(now.problem, theta, s, now.point.states, list(now.equations))
+        there = weighed_with(now.problem, point, weighed(now.problem, point, list(now.equations)))
+        if _cost(now.problem, now.named, point, there.log_likelihood) < now.cost - MIN_GAIN:
+            return there
+    return None
+
+
+def _apply(now: Fitted, step: Step, share: float) -> Step:
+    """Return the parameters and s after a share of a step, within their bounds."""
+    free, sd = now.free, now.problem.sd(now.named)
+    largest = np.where(np.arange(len(free)) < len(now.named), MAX_EFFECT, MAX_NUISANCE) * sd
+    theta = now.point.theta + share * step[0]
+    theta[free] = np.clip(theta[free], np.maximum(now.problem.lower_bounds(free), -largest), largest)
+    return theta, np.clip(now.point.s + share * step[1], 0, MAX_STIFFNESS)
+
+
+def _predicted_gain(now: Fitted, theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"]) -> float:
+    """Return by how much the normal equations predict that the misfit is lower there [nat, doubled]."""
+    free, sd, point = now.free, now.problem.sd(now.named), now.point
+    displacement = np.concatenate([s - point.s, (theta - point.theta)[free], [1.0]])
+    gain = float(now.square[-1, -1] - displacement @ now.square @ displacement)
+    return gain + _prior(point.theta, point.s, free, sd) - _prior(theta, s, free, sd)
+
+
+def candidate_steps(now: Fitted, *, likeliest_set: bool = True) -> list[Step]:
+    """Return the candidate steps, each with the parameters that fit its s best.
+
+    They are: to the particles that are more likely attached than not; with the current s; and to the likeliest set of
+    attachments. If any of many particles may hold a load, none of them is more likely attached than not, and yet one
+    must be. The same holds if a load is smaller than assumed, because all that hold it are softer, but none of them
+    alone. Only then all s may change by one factor; elsewhere the best factor would follow the noise.
+    """
+    detected = now.problem.prior.bounded(jnp.where(now.summary.probability > 0.5, now.summary.b, 0.0))
+    steps = [_towards(now, np.asarray(detected)), parameter_step(now)]
+    if not now.attached.any():
+        steps.append(common_factor_step(now))
+    return [*steps, _towards(now, np.asarray(likeliest(now.belief)))] if likeliest_set else steps
+
+
+def parameter_step(now: Fitted) -> Step:
+    """Return the step of the parameters alone."""
+    return _towards(now, now.point.s)
+
+
+def common_factor_step(now: Fitted) -> Step:
+    """Return the step of all s by the common factor that fits best, with the parameters marginalised."""
+    s, belief = now.point.s, now.belief
+    factor = (s @ np.asarray(belief.shift) + FACTOR_PRECISION) / (
+        s @ np.asarray(belief.precision) @ s + FACTOR_PRECISION
+    )
+    return _towards(now, factor * s)
+
+
+def _towards(now: Fitted, to: Float[np.ndarray, " n"]) -> Step:
+    """Return the step to a given s, with the parameters that fit it best."""
+    point, free, sd = now.point, now.free, now.problem.sd(now.named)
+    best = _joint(now.square, point, free, sd).condition(s=to - point.s).mean()
+    theta = np.zeros(len(point.theta))
+    theta[free] = np.clip(best, -MAX_CHANGE * sd, MAX_CHANGE * sd)
+    return theta, to - point.s
+
+
+def _summary(problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> PosteriorSummary:
+    """Return the posterior of the attachments at a point, with the parameters marginalised."""
+    step = _joint(square, point, free, sd).marginal("s")
+    shift = step.precision @ point.s + step.shift
+    return quick_summary(problem.prior.add(jnp.asarray(step.precision), jnp.asarray(shift)))
+
+
+def _joint(square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> GaussianInformation:
+    """Return the information about steps of s and of the free parameters, with the prior of the parameters."""
+    joint = GaussianInformation.from_normal_equations(square, s=len(point.s), theta=len(free))
+    return joint.with_independent("theta", sd**-2, -point.theta[free] / sd**2)
+
+
+def _cost(problem: Problem, named: np.ndarray, point: Point, log_likelihood: float) -> float:
+    """Return twice the negative logarithm of likelihood and prior [nat]."""
+    return _prior(point.theta, point.s, problem.free(named), problem.sd(named)) - 2 * log_likelihood
+
+
+def _prior(theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"], free: np.ndarray, sd: np.ndarray) -> float:
+    """Return twice the negative logarithm of the prior, without constants."""
+    return 2 * ATTACHMENT_LOG_ODDS * float(np.sum(s > 0)) + float(np.sum((theta[free] / sd) ** 2))

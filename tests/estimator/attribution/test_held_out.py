@@ -1,0 +1,57 @@
+"""Variances of held-out predictions: how residuals move with stiffnesses and parameters, against finite differences."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator.attribution.every_frame import weighed
+from jiggle_mj.estimator.attribution.gauss_newton import start
+from jiggle_mj.estimator.attribution.held_out import predict_held_out, responses
+from jiggle_mj.estimator.blas import one_thread
+
+STEPS = {"attached": 0.02, "stretch": 0.05, "bending": 0.3}
+"""Steps of the finite differences to both sides: of s, and of each parameter by its prior standard deviation."""
+COSINE, SIZE = 0.93, (0.6, 1.7)
+"""Least cosine between both movements of all particles, and range of the ratio of their lengths. The linear one has
+earlier frames fixed, whose friction the finite difference changes too."""
+
+
+@pytest.mark.parametrize("moved", ["attached", "stretch", "bending"])
+def test_residuals_move_as_finite_differences_of_the_prediction_say(light, moved):
+    """At the last fitted frame, where the pull is largest; what is held stays where it was observed."""
+    fitted = light[0].declared.fitted
+    problem, point, frames = fitted.problem, fitted.point, list(fitted.equations)
+    k, n = frames[-1], len(point.s)
+    free_parameter = "attached" if moved == "attached" else int(problem.sheet.place(moved)[0])
+    column = int(np.argmax(point.s))
+    if free_parameter != "attached":
+        column = n + int(np.flatnonzero(fitted.free == free_parameter)[0])
+    seen = []
+    with jax.enable_x64(True), one_thread():
+        _, by_fit = responses(fitted, point, weighed(problem, point, [k])[k], k)
+        for step in (STEPS[moved], -STEPS[moved]):
+            theta, s = point.theta.copy(), point.s.copy()
+            if free_parameter == "attached":
+                s[column] += step
+            else:
+                theta[free_parameter] += step
+            seen.append(start(problem, theta, s, point.states, frames).seen[k])
+    difference = (seen[1] - seen[0]) / (2 * STEPS[moved])
+    free = ~np.asarray(problem.history.frames[k].frame.held)
+    found = by_fit[:, column].reshape(n, 3)
+    lengths = [float(np.linalg.norm(one[free])) for one in (found, difference)]
+    assert np.sum(found[free] * difference[free]) > COSINE * lengths[0] * lengths[1]
+    assert SIZE[0] < lengths[0] / lengths[1] < SIZE[1]
+
+
+def test_a_parameter_that_is_less_certain_widens_the_prediction(light):
+    """With a tenth of the information, what the fit leaves open has more variance, and everything else has the same."""
+    fitted = light[0].declared.fitted
+    part = light[2].frames[-1].part
+    with jax.enable_x64(True), one_thread():
+        known = predict_held_out(fitted, part).variances
+        vague = predict_held_out(replace(fitted, square=fitted.square / 10), part).variances
+    assert np.all(vague.fit >= known.fit) and vague.fit.sum() > 1.1 * known.fit.sum()
+    np.testing.assert_array_equal(vague.others, known.others)

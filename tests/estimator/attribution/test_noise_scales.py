@@ -1,0 +1,46 @@
+"""Sizes of the errors: their prior, and the likeliest ones."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from jiggle_mj.estimator.attribution.gauss_newton import linearise_at
+from jiggle_mj.estimator.attribution.likeliest_scales import LOG_RANGE, likeliest_scales
+from jiggle_mj.estimator.attribution.noise_scales import NoiseScales, log_prior
+from jiggle_mj.estimator.blas import one_thread
+
+CHANGE = 1.3
+"""Factor by which each variance is changed, more than the search's error and less than its step."""
+
+
+def test_the_prior_of_a_logarithm_has_a_total_of_one():
+    logs = np.linspace(-40, 40, 8001)
+    density = np.exp([log_prior(float(np.exp(one))) for one in logs])
+    assert np.trapezoid(density, logs) == pytest.approx(1, abs=1e-6)
+
+
+def test_a_variance_as_assumed_is_usual_and_a_large_one_is_not():
+    assert NoiseScales().larger < 0.5
+    sizes = [NoiseScales(force=size).larger for size in (0.1, 0.5, 1.0, 3.0, 10.0, 1e3)]
+    assert sizes == sorted(sizes) and sizes[-1] > 0.999
+
+
+def test_the_likeliest_variances_have_the_largest_posterior(light):
+    """Against the cost of fits at the same point with each variance changed, within their range."""
+    fitted = light[0].declared.fitted
+    with jax.enable_x64(True), one_thread():
+        scales = likeliest_scales(fitted)
+
+        def log_posterior(one: NoiseScales) -> float:
+            there = linearise_at(fitted.problem.with_scales(one), fitted.named, fitted.point, list(fitted.equations))
+            return one.log_prior() - there.cost / 2
+
+        best = log_posterior(scales)
+        for name in ("force", "fields", "tool"):
+            value = getattr(scales, name)
+            within = [one for one in (value * CHANGE, value / CHANGE) if np.log(one) >= LOG_RANGE[0]]
+            assert within
+            for changed in within:
+                assert log_posterior(replace(scales, **{name: changed})) < best, name
