@@ -35,7 +35,7 @@ class Closed:
     """Result of closing the loop."""
 
     verdict: str
-    """EvidenceVerdict: no-effect, effect, ambiguous, effect-with-remainder or unexplained."""
+    """Verdict: no-effect, effect, ambiguous, effect-with-remainder or unexplained."""
     declared: Hypothesis
     """The declared model."""
     final: Hypothesis
@@ -99,7 +99,9 @@ def close_the_loop(
         log(f"{name} taken out again: {why}")
     last = path[-1]
     left = remainder_of_fit(last.fitted)
-    before, after = (leave_one_out(one.fitted, used) for one in (declared, last))
+    before = leave_one_out(declared.fitted, used)
+    folds_before = held_out(before)
+    after = before if last is declared else leave_one_out(last.fitted, used)
     thetas = [one.point.theta[last.fitted.named] for one in after.values()]
     return Closed(
         verdict=_verdict(decision, last, dropped),
@@ -108,7 +110,7 @@ def close_the_loop(
         rivals=[found[k] for k in decision.rivals if found[k].added] if not dropped else [],
         hypotheses=[(found[k], float(decision.probabilities[k])) for k in np.argsort(-decision.probabilities)],
         dropped=dropped,
-        folds=(held_out(before), held_out(after)),
+        folds=(folds_before, folds_before if last is declared else held_out(after)),
         sds=np.maximum(parameters_sd(last.fitted), jackknife_sd(thetas, len(last.fitted.named))),
         reported=(predicted[0], predicted[-1]) if predicted else None,
         remainder=left,

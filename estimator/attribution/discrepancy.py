@@ -86,9 +86,9 @@ def refused(closed: Closed) -> list[dict[str, str]]:
     for one, probability in closed.hypotheses:
         for name in one.names:
             if name not in named:
-                title, lead = " and ".join(best.names) or "nothing", best.log_evidence - one.log_evidence
-                with_others = f" beside {' and '.join(set(one.names) - {name})}" if len(one.names) > 1 else ""
-                why = f"its probability{with_others} is {probability:.2g}; {title} leads by {lead:.0f} nat"
+                lead, others = best.log_evidence - one.log_evidence, [other for other in one.names if other != name]
+                beside = f" beside {' and '.join(others)}" if others else ""
+                why = f"its probability{beside} is {probability:.2g}; {best.title} leads by {lead:.0f} nat"
                 reasons.setdefault(name, why)
     return [{"name": name, "why": why} for name, why in reasons.items()]
 

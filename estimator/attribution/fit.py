@@ -13,7 +13,6 @@ import numpy as np
 from .every_frame import weighed
 from .gauss_newton import (
     Fitted,
-    Weighed,
     better_point,
     candidate_steps,
     fit_at,
@@ -63,10 +62,7 @@ def fit(
     frames = problem.frames(parts)
     problem = problem.with_scales(NoiseScales())
     begun = [weighed_with(problem, point, weighed(problem, point, frames)) for point in starts]
-    if before is not None:
-        begun.append(
-            Weighed(problem=problem, point=before.point, weights=before.weights, log_likelihood=before.log_likelihood)
-        )
+    begun += [] if before is None else [before]
     likelihoods = np.nan_to_num([one.log_likelihood for one in begun], nan=-np.inf)
     assumed = now = gauss_newton(linearised_fit(begun[int(np.argmax(likelihoods))], named), log=log)
     for _ in range(MAX_SCALES):

@@ -46,13 +46,23 @@ Step = tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fitted:
-    """Result of a fit."""
+class Weighed:
+    """A point with the weights of the residuals there."""
 
     problem: Problem
-    """What was fitted to, with the noise scales of the fit."""
+    """What is fitted to, with the noise scales of the weights."""
     point: Point
-    """Fitted parameters and states."""
+    """Parameters and states."""
+    weights: dict[int, FrameLikelihood]
+    """Weights of the residuals of each frame."""
+    log_likelihood: float
+    """Log density of the observations, determinants included [nat], up to a constant of the frames."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted(Weighed):
+    """Result of a fit: its point with the errors' sizes of the fit, and what follows there."""
+
     named: np.ndarray
     """Parameters of the effects in the model."""
     free: np.ndarray
@@ -61,12 +71,8 @@ class Fitted:
     """Normal equations over s, the free parameters and -1."""
     equations: dict[int, NormalEquations]
     """Normal equations of each frame."""
-    weights: dict[int, FrameLikelihood]
-    """Weights of the residuals of each frame."""
     summary: PosteriorSummary
     """Posterior of the attachments, with the free parameters marginalised."""
-    log_likelihood: float
-    """Log density of the observations, determinants included [nat], up to a constant of the frames."""
 
     @property
     def cost(self) -> float:
@@ -125,20 +131,6 @@ def gauss_newton(
         before, now = now, linearised_fit(better, now.named)
         log(f"step {count + 1}: {before.cost / 2:.1f} -> {now.cost / 2:.1f} nat")
     return now
-
-
-@dataclass(frozen=True, kw_only=True)
-class Weighed:
-    """A point with the weights of the residuals there."""
-
-    problem: Problem
-    """What is fitted to."""
-    point: Point
-    """The point."""
-    weights: dict[int, FrameLikelihood]
-    """Weights of the residuals of each frame."""
-    log_likelihood: float
-    """Log density of the observations [nat], up to a constant of the frames."""
 
 
 def weighed_with(problem: Problem, point: Point, weights: dict[int, FrameLikelihood]) -> Weighed:

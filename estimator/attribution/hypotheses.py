@@ -73,6 +73,11 @@ class Hypothesis:
         return tuple(one.effect.name for one in self.added)
 
     @property
+    def title(self) -> str:
+        """Return the names as text."""
+        return " and ".join(self.names) or "nothing"
+
+    @property
     def evidence(self) -> HypothesisEvidence:
         """Return the evidence for a verdict."""
         sites = int(np.prod([one.effect.sites for one in self.added]))
@@ -136,7 +141,7 @@ def likely(one: Hypothesis, log: Log) -> list[Score]:
     """Return the scores of the effects to add to a hypothesis: the likeliest, and close ones often confused with it."""
     found = scores(one.fits.assumed)
     one.scores.extend(found)
-    log(f"scores beside {_title(one.names)}: " + ", ".join(f"{s.name} {s.log_bayes_factor:.1f}" for s in found[:6]))
+    log(f"scores beside {one.title}: " + ", ".join(f"{s.name} {s.log_bayes_factor:.1f}" for s in found[:6]))
     entering = [score for score in found if score.log_bayes_factor > MIN_SCORE]
     if not entering:
         return []
@@ -173,11 +178,7 @@ def left_out(last: Hypothesis, one: AddedEffect, used: set[int], log: Log) -> Hy
 def _report(one: Hypothesis, log: Log) -> None:
     scales = ", ".join(f"{value:.2g}" for value in one.fitted.problem.scales.values)
     sizes = "; ".join(np.array2string(one.theta(added), precision=4) for added in one.added)
-    log(f"{_title(one.names)}: ln Z {one.log_evidence:.1f}, theta {sizes}, variances {scales}")
-
-
-def _title(names: tuple[str, ...]) -> str:
-    return " and ".join(names) or "nothing"
+    log(f"{one.title}: ln Z {one.log_evidence:.1f}, theta {sizes}, variances {scales}")
 
 
 def leave_one_out(fitted: Fitted, used: set[int]) -> dict[int, Fitted]:

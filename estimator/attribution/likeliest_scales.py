@@ -55,7 +55,8 @@ def likeliest_scales(fitted: Fitted) -> NoiseScales:
 
     def at(step: int) -> tuple[float, float]:
         if step not in found:
-            force = float(np.exp(np.clip(began + step * STEP, *LOG_RANGE)))
+            moved = float(np.exp(np.clip(began + step * STEP, *LOG_RANGE)))
+            force = moved if step else fitted.problem.scales.force  # whose weights the fit has
             misfit = _misfit(fitted, force)
             amplitude, value = _largest(misfit.log_likelihood)
             found[step] = value + log_prior(force), amplitude
