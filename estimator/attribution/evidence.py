@@ -26,12 +26,13 @@ def log_model_evidence(fitted: Fitted) -> float:
     free, sd = fitted.free, problem.sd(fitted.named)
     inside = point.theta[free] > problem.lower_bounds(free) + NEAR_BOUND * sd
     joint = GaussianInformation.from_normal_equations(fitted.square, s=n, theta=len(free))
-    joint = joint.with_independent("theta", sd**-2)
-    precision, shift = np.asarray(joint.precision), np.asarray(joint.shift)[:n]
+    joint = joint.with_independent("theta", sd**-2, -point.theta[free] / sd**2)
+    precision, slope = np.asarray(joint.precision), np.asarray(joint.shift)
     of_theta = precision[n:, n:][np.ix_(inside, inside)]
     beside = precision[:n, n:][:, inside]
-    # the parameters are where they fit best, so that s alone has a slope
-    information = precision[:n, :n] - beside @ np.linalg.solve(of_theta, beside.T)
+    # what the parameters leave of the slope in s; their own counts for nothing, as no step along it was found better
+    solved = np.linalg.solve(of_theta, np.column_stack([beside.T, slope[n:][inside]]))
+    information, shift = precision[:n, :n] - beside @ solved[:, :-1], slope[:n] - beside @ solved[:, -1]
     scaled = of_theta * np.outer(sd[inside], sd[inside])
     log_prior = -0.5 * np.sum((point.theta[free] / sd) ** 2) - 0.5 * np.linalg.slogdet(scaled)[1]
     about = -0.5 * point.s @ information @ point.s - shift @ point.s

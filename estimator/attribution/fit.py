@@ -17,6 +17,7 @@ from .gauss_newton import (
     candidate_steps,
     fit_at,
     gauss_newton,
+    largest_predicted_gain,
     linearise_at,
     linearised_fit,
     weighed_with,
@@ -46,7 +47,8 @@ def fit(
     starts: list[Point],
     parts: set[int],
     *,
-    before: Fitted | None = None,
+    before: Fits | None = None,
+    worth: float = -np.inf,
     log: Callable[[str], None] = lambda _: None,
 ) -> Fits:
     """Return the fits of named parameters, nuisance parameters and all stiffnesses to frames of some parts.
@@ -56,23 +58,34 @@ def fit(
         named: parameters of the effects in the model.
         starts: points that the fit may begin at; it begins at the likeliest.
         parts: parts whose frames are fitted to.
-        before: a fit with errors of the assumed size without some of the parameters, which is a start too.
+        before: fits without some of the parameters, which are starts too.
+        worth: log posterior [nat]; a fit that cannot reach it, as far as its normal equations tell, ends early.
         log: receives progress messages.
     """
     frames = problem.frames(parts)
     problem = problem.with_scales(NoiseScales())
     begun = [weighed_with(problem, point, weighed(problem, point, frames)) for point in starts]
-    begun += [] if before is None else [before]
+    begun += [] if before is None else [before.assumed]
     likelihoods = np.nan_to_num([one.log_likelihood for one in begun], nan=-np.inf)
     assumed = now = gauss_newton(linearised_fit(begun[int(np.argmax(likelihoods))], named), log=log)
-    for _ in range(MAX_SCALES):
-        scales, last = likeliest_scales(now), now.problem.scales
-        log(f"variances {', '.join(f'{value:.3g}' for value in scales.values)} of the assumed ones")
-        now = linearise_at(problem.with_scales(scales), named, now.point, frames)
-        if np.allclose(np.log(scales.values[:2]), np.log(last.values[:2]), rtol=0, atol=SETTLED):
+    near = None if before is None else before.likeliest.problem.scales
+    for count in range(MAX_SCALES):
+        now, settled = _with_likeliest_scales(now, near if count == 0 else None, log)
+        if count == 0 and before is not None:
+            other = linearised_fit(before.likeliest, named)
+            now, settled = (other, False) if other.log_posterior > now.log_posterior else (now, settled)
+        if settled or not now.log_posterior + largest_predicted_gain(now) / 2 > worth:
             break
         now = gauss_newton(now, log=log)
     return Fits(assumed=assumed, likeliest=now)
+
+
+def _with_likeliest_scales(now: Fitted, near: NoiseScales | None, log: Callable[[str], None]) -> tuple[Fitted, bool]:
+    """Return a fit's point under its likeliest scales, searched near some, and whether they hardly changed."""
+    scales, last = likeliest_scales(now, near=near), now.problem.scales
+    log(f"variances {', '.join(f'{value:.3g}' for value in scales.values)} of the assumed ones")
+    settled = np.allclose(np.log(scales.values[:2]), np.log(last.values[:2]), rtol=0, atol=SETTLED)
+    return linearise_at(now.problem.with_scales(scales), now.named, now.point, list(now.equations)), settled
 
 
 def without(fitted: Fitted, part: int) -> Fitted:

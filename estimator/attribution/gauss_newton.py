@@ -29,16 +29,16 @@ MAX_STIFFNESS = 0.98
 """Largest bounded stiffness."""
 MAX_GAUSS_NEWTON_STEPS = 10
 """Largest number of Gauss-Newton steps."""
-STEP_SHARES = (1.0, 0.4, 0.15, 0.05)
-"""Shares of a step that are tried."""
+SHORTER_SHARES = (0.3, 0.1)
+"""Shares of a step that are tried after the whole one."""
 MAX_EFFECT, MAX_NUISANCE = 4.0, 3.0
 """Largest size of a parameter of an effect, and of a nuisance parameter [prior standard deviations]."""
 MAX_CHANGE = 1.5
 """Largest change of a parameter in one step [prior standard deviations]."""
 MIN_GAIN = 2.0
 """Fall of the cost that is worth a step [nat, doubled]."""
-MAX_TRIED = 3
-"""Largest number of candidate points that are tried in a step."""
+MAX_WHOLE = 2
+"""Largest number of whole steps that are tried before shorter ones."""
 FACTOR_PRECISION = 1e-2
 """Prior precision of a common factor of all s about 1. It decides where no frame shows an attachment."""
 Step = tuple[Float[np.ndarray, " p"], Float[np.ndarray, " n"]]
@@ -78,6 +78,11 @@ class Fitted(Weighed):
     def cost(self) -> float:
         """Return twice the negative logarithm of likelihood and prior [nat]."""
         return _cost(self.problem, self.named, self.point, self.log_likelihood)
+
+    @property
+    def log_posterior(self) -> float:
+        """Return the logarithm of likelihood and prior, of the noise scales too [nat]; -inf where it is no number."""
+        return float(np.nan_to_num(self.problem.scales.log_prior() - self.cost / 2, nan=-np.inf))
 
     @property
     def belief(self) -> AttachmentBelief:
@@ -169,22 +174,29 @@ def fit_at(at: Weighed, named: np.ndarray, equations: dict[int, NormalEquations]
 
 
 def better_point(now: Fitted, steps: list[Step]) -> Weighed | None:
-    """Return a point of lower cost; None if none of the likeliest candidates has one.
+    """Return a point of lower cost; None if none is found.
 
-    The share of a step with the largest predicted gain is tried first. The posterior may have stiffnesses that fit
-    worse; a step of the parameters alone then has the larger gain.
+    Whole steps are tried first, those of the largest predicted gain, then shorter ones along the first of them. The
+    posterior may have stiffnesses that fit worse; a step of the parameters alone then has the larger gain.
     """
-    candidates = [_apply(now, step, share) for step in steps for share in STEP_SHARES]
-    gains = np.array([_predicted_gain(now, theta, s) for theta, s in candidates])
-    for k in np.argsort(-gains, kind="stable")[:MAX_TRIED]:
-        if not gains[k] > MIN_GAIN:
-            return None
-        theta, s = candidates[k]
+
+    def gain(step: Step, share: float) -> float:
+        return _predicted_gain(now, *_apply(now, step, share))
+
+    whole = sorted((step for step in steps if gain(step, 1.0) > MIN_GAIN), key=lambda step: -gain(step, 1.0))
+    shorter = [(step, share) for step in whole[:1] for share in SHORTER_SHARES]
+    for step, share in [*((step, 1.0) for step in whole[:MAX_WHOLE]), *shorter]:
+        theta, s = _apply(now, step, share)
         point = start(now.problem, theta, s, now.point.states, list(now.equations))
         there = weighed_with(now.problem, point, weighed(now.problem, point, list(now.equations)))
         if _cost(now.problem, now.named, point, there.log_likelihood) < now.cost - MIN_GAIN:
             return there
     return None
+
+
+def largest_predicted_gain(now: Fitted) -> float:
+    """Return by how much the cost falls in the best whole step, as the normal equations predict it [nat, doubled]."""
+    return max(_predicted_gain(now, *_apply(now, step, 1.0)) for step in candidate_steps(now))
 
 
 def _apply(now: Fitted, step: Step, share: float) -> Step:

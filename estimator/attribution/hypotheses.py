@@ -15,7 +15,7 @@ from ..parallel_map import parallel_map
 from .evidence import log_model_evidence
 from .fit import Fits, fit, without
 from .gauss_newton import Fitted, moved
-from .scores import Score, scores
+from .scores import MIN_SCORE, Score, scores
 from .starts import ObservedStates, stepped
 from .verdict import HypothesisEvidence, log_posterior
 
@@ -23,10 +23,11 @@ MAX_EFFECTS = 3
 """Largest number of effects of a hypothesis."""
 BEAM = 3
 """Hypotheses of each size that are searched on from."""
-REACH = 4.0
-"""Difference of log posterior from the best up to which hypotheses are searched on from [nat]."""
-MIN_SCORE = 5.0
-"""Log Bayes factor of one step from which an effect is fitted [nat]. The prior alone is against each by 4."""
+REACH = 3.0
+"""Difference of log posterior from the best up to which hypotheses are searched on from [nat]: a twentieth of its
+probability, less than what the credible set leaves out."""
+HOPELESS = 50.0
+"""Difference of the log posterior of fits from which one is not fitted to its end [nat]: its share is too small."""
 N_FITTED = 4
 """Number of effects that are fitted in addition to a hypothesis, the likeliest by their scores."""
 COMPARED_SHARE = 0.5
@@ -122,7 +123,8 @@ def search(declared: Hypothesis, observed: ObservedStates, used: set[int], log: 
             for score in likely(one, log):
                 key = frozenset((*one.names, score.name))
                 if key not in found:
-                    found[key] = added_to(one, score, observed, used, log)
+                    worth = max(other.fitted.log_posterior for other in found.values()) - HOPELESS
+                    found[key] = added_to(one, score, observed, used, worth, log)
                     new.append(found[key])
         beam = sorted(new, key=posterior, reverse=True)[:BEAM]
         if not beam or posterior(beam[0]) < best:
@@ -151,25 +153,28 @@ def likely(one: Hypothesis, log: Log) -> list[Score]:
     return entering[:N_FITTED] + [score for score in near if score.name in confused]
 
 
-def added_to(before: Hypothesis, score: Score, observed: ObservedStates, used: set[int], log: Log) -> Hypothesis:
-    """Return a hypothesis with one more effect, fitted."""
+def added_to(
+    before: Hypothesis, score: Score, observed: ObservedStates, used: set[int], worth: float, log: Log
+) -> Hypothesis:
+    """Return a hypothesis with one more effect, fitted; to its end only if it may reach a log posterior [nat]."""
     last = before.fits.assumed
     problem = last.problem
     effect = problem.sheet.effect(score.name)
     one = AddedEffect(effect=effect, score=score, at=problem.sheet.place(effect.name, score.site))
     named = np.append(last.named, one.at).astype(int)
     begun = stepped(last, one.at, score) if score.began is None else score.began
-    fits = fit(problem, named, [begun, *observed.starts(named)], used, before=last)
+    fits = fit(problem, named, [begun, *observed.starts(named)], used, before=before.fits, worth=worth)
     result = hypothesis_of(fits, (*before.added, one), before)
     _report(result, log)
     return result
 
 
 def left_out(last: Hypothesis, one: AddedEffect, used: set[int], log: Log) -> Hypothesis:
-    """Return a hypothesis without one of its effects, fitted again."""
+    """Return a hypothesis without one of its effects, fitted again; to its end only if it may be nearly as likely."""
     begun = last.fits.assumed
     named = begun.named[~np.isin(begun.named, one.at)]
-    fits = fit(begun.problem, named, [moved(begun, one.at, np.zeros(len(one.at)))], used)
+    worth = last.fitted.log_posterior - HOPELESS
+    fits = fit(begun.problem, named, [moved(begun, one.at, np.zeros(len(one.at)))], used, worth=worth)
     result = hypothesis_of(fits, tuple(other for other in last.added if other is not one), last.path[0])
     _report(result, log)
     return result

@@ -20,10 +20,12 @@ from .normal_equations import tool_sum
 from .problem import AMPLITUDE
 
 STEP = float(np.log(3.0))
-"""Step of the search in the logarithm of the force variance [nat]."""
-MAX_STEPS = 6
-"""Largest number of steps of the search."""
-LOG_RANGE = (-1.5, 14.0)
+"""First step of the search in the logarithm of the force variance [nat]."""
+MAX_EVALUATIONS = 9
+"""Largest number of variances that the search tries."""
+NEAR = 0.25
+"""Distance from a place that was tried up to which the search trusts its parabola [nat]."""
+LOG_RANGE = (-3.0, 14.0)
 """Range of the logarithms of all variances [nat]. Where a sheet was measured in one plane, or the tool is the mean of
 what it holds, some residuals are 0, and the likelihood would rise towards a variance of 0."""
 
@@ -48,34 +50,56 @@ class _Misfit:
         return 0.5 * float(gain - self.squared)
 
 
-def likeliest_scales(fitted: Fitted) -> NoiseScales:
-    """Return the noise scales of largest posterior at a fit's point."""
-    began = float(np.log(fitted.problem.scales.force))
-    found: dict[int, tuple[float, float]] = {}
+def likeliest_scales(fitted: Fitted, *, near: NoiseScales | None = None) -> NoiseScales:
+    """Return the noise scales of largest posterior at a fit's point.
 
-    def at(step: int) -> tuple[float, float]:
-        if step not in found:
-            moved = float(np.exp(np.clip(began + step * STEP, *LOG_RANGE)))
-            force = moved if step else fitted.problem.scales.force  # whose weights the fit has
-            misfit = _misfit(fitted, force)
-            amplitude, value = _largest(misfit.log_likelihood)
-            found[step] = value + log_prior(force), amplitude
-        return found[step]
+    Args:
+        fitted: a fit.
+        near: scales that the search begins at; those of the fit if None.
+    """
+    amplitudes: dict[float, float] = {}
 
-    best = 0
-    for _ in range(MAX_STEPS):
-        around = max((best, best - 1, best + 1), key=lambda step: at(step)[0])
-        if around == best:
-            break
-        best = around
-    (below, _), (middle, amplitude), (above, _) = at(best - 1), at(best), at(best + 1)
-    bend = below - 2 * middle + above
-    top = 0.5 * (below - above) / bend if bend < 0 else 0.0
+    def log_posterior(log_force: float) -> float:
+        misfit = _misfit(fitted, float(np.exp(log_force)))
+        amplitudes[log_force], value = _largest(misfit.log_likelihood)
+        return value + log_prior(misfit.force)
+
+    log_force = _maximum(log_posterior, float(np.log((near or fitted.problem.scales).force)))
+    nearest = min(amplitudes, key=lambda tried: abs(tried - log_force))
     squared = tool_sum(fitted.problem, fitted.equations)
     degrees = 3 * len(fitted.equations)
     tool, _ = _largest(lambda variance: -0.5 * (squared / variance + degrees * np.log(variance)))
-    log_force = np.clip(began + STEP * (best + np.clip(top, -0.5, 0.5)), *LOG_RANGE)
-    return NoiseScales(force=float(np.exp(log_force)), fields=amplitude, tool=tool)
+    return NoiseScales(force=float(np.exp(log_force)), fields=amplitudes[nearest], tool=tool)
+
+
+def _maximum(function: Callable[[float], float], begun: float) -> float:
+    """Return where a function with one maximum has it.
+
+    The steps grow until the maximum lies between two; then parabolas through the best three places lead there.
+    """
+    found = {float(np.clip(x, *LOG_RANGE)): 0.0 for x in (begun - STEP, begun, begun + STEP)}
+    found = {x: function(x) for x in found}
+    while len(found) < MAX_EVALUATIONS:
+        places = sorted(found)
+        best = int(np.argmax([found[x] for x in places]))
+        if 0 < best < len(places) - 1:
+            following = _vertex(*((x, found[x]) for x in places[best - 1 : best + 2]))
+        else:
+            outwards = -1 if best == 0 else 1
+            following = float(np.clip(places[best] + outwards * (places[-1] - places[0]), *LOG_RANGE))
+        if min(abs(following - x) for x in places) < NEAR:
+            return following
+        found[following] = function(following)
+    return max(found, key=lambda x: found[x])
+
+
+def _vertex(below: tuple[float, float], middle: tuple[float, float], above: tuple[float, float]) -> float:
+    """Return where the parabola through three points has its vertex; the middle one is not the lowest."""
+    left, right = middle[0] - below[0], above[0] - middle[0]
+    falls = (middle[1] - below[1]) / left, (middle[1] - above[1]) / right
+    if not sum(falls) > 0:
+        return middle[0]
+    return middle[0] + 0.5 * (right * falls[0] - left * falls[1]) / sum(falls)
 
 
 def _largest(log_likelihood: Callable[[float], float]) -> tuple[float, float]:
