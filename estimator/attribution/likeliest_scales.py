@@ -20,11 +20,11 @@ from .normal_equations import tool_sum
 from .problem import AMPLITUDE
 
 STEP = float(np.log(3.0))
-"""First step of the search in the logarithm of the force variance [nat]."""
+"""First steps of the search in the logarithm of the force variance [nat]."""
 MAX_EVALUATIONS = 9
 """Largest number of variances that the search tries."""
 NEAR = 0.25
-"""Distance from a place that was tried up to which the search trusts its parabola [nat]."""
+"""Distance from a place that was tried within which the search ends [nat]."""
 LOG_RANGE = (-3.0, 14.0)
 """Range of the logarithms of all variances [nat]. Where a sheet was measured in one plane, or the tool is the mean of
 what it holds, some residuals are 0, and the likelihood would rise towards a variance of 0."""
@@ -64,7 +64,7 @@ def likeliest_scales(fitted: Fitted, *, near: NoiseScales | None = None) -> Nois
         amplitudes[log_force], value = _largest(misfit.log_likelihood)
         return value + log_prior(misfit.force)
 
-    log_force = _maximum(log_posterior, float(np.log((near or fitted.problem.scales).force)))
+    log_force = maximum(log_posterior, float(np.log((near or fitted.problem.scales).force)))
     nearest = min(amplitudes, key=lambda tried: abs(tried - log_force))
     squared = tool_sum(fitted.problem, fitted.equations)
     degrees = 3 * len(fitted.equations)
@@ -72,34 +72,31 @@ def likeliest_scales(fitted: Fitted, *, near: NoiseScales | None = None) -> Nois
     return NoiseScales(force=float(np.exp(log_force)), fields=amplitudes[nearest], tool=tool)
 
 
-def _maximum(function: Callable[[float], float], begun: float) -> float:
-    """Return where a function with one maximum has it.
+def maximum(function: Callable[[float], float], begun: float) -> float:
+    """Return where a log likelihood has its maximum over the logarithm of a variance, within its range.
 
-    The steps grow until the maximum lies between two; then parabolas through the best three places lead there.
+    It falls exponentially below its maximum and linearly above it, as that of Gaussian residuals does. So the search
+    goes to where the function -(a exp(-x) + b x) / 2 through three places has its maximum.
     """
-    found = {float(np.clip(x, *LOG_RANGE)): 0.0 for x in (begun - STEP, begun, begun + STEP)}
-    found = {x: function(x) for x in found}
+    begun = float(np.clip(begun, LOG_RANGE[0] + STEP, LOG_RANGE[1] - STEP))
+    found = {x: function(x) for x in (begun - STEP, begun, begun + STEP)}
     while len(found) < MAX_EVALUATIONS:
         places = sorted(found)
         best = int(np.argmax([found[x] for x in places]))
-        if 0 < best < len(places) - 1:
-            following = _vertex(*((x, found[x]) for x in places[best - 1 : best + 2]))
+        middle = min(max(best, 1), len(places) - 2)
+        around = np.array(places[middle - 1 : middle + 2])
+        columns = np.column_stack([np.diff(np.exp(-around)), np.diff(around)])
+        a, b = np.linalg.solve(columns, -2 * np.diff([found[x] for x in around]))
+        if a > 0 and b > 0:
+            following = float(np.log(a / b))
         else:
-            outwards = -1 if best == 0 else 1
-            following = float(np.clip(places[best] + outwards * (places[-1] - places[0]), *LOG_RANGE))
+            other_end = places[-1] if best == 0 else places[0]
+            following = 2 * places[best] - other_end if best != middle else float(np.mean(around[:2]))
+        following = float(np.clip(following, *LOG_RANGE))
         if min(abs(following - x) for x in places) < NEAR:
             return following
         found[following] = function(following)
     return max(found, key=lambda x: found[x])
-
-
-def _vertex(below: tuple[float, float], middle: tuple[float, float], above: tuple[float, float]) -> float:
-    """Return where the parabola through three points has its vertex; the middle one is not the lowest."""
-    left, right = middle[0] - below[0], above[0] - middle[0]
-    falls = (middle[1] - below[1]) / left, (middle[1] - above[1]) / right
-    if not sum(falls) > 0:
-        return middle[0]
-    return middle[0] + 0.5 * (right * falls[0] - left * falls[1]) / sum(falls)
 
 
 def _largest(log_likelihood: Callable[[float], float]) -> tuple[float, float]:

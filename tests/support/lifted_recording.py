@@ -22,9 +22,9 @@ from tests.support.small_sheet import (
     GRIP_RADIUS,
     STIFFNESS,
     attached,
+    balance_of,
     lifts,
     sheet,
-    sheet_balance,
     sheet_energy,
 )
 
@@ -58,7 +58,7 @@ def lifted(gravity: float, tethering: float = 0.0) -> tuple[np.ndarray, ...]:
         springs = tethering * jnp.asarray(sheet().particle_area)[:, None, None] * jnp.eye(3)[None]
         tether = eqx.tree_at(lambda t: t.stiffness, Tether.build(sheet().rest), springs)
         energy = SheetEnergy.build(np.asarray(energy.rest), (*energy.terms, tether), energy.layout)
-    balance, k = sheet_balance(1e-4).with_energy(energy), DECLARATION.membrane_stiffness
+    balance, k = balance_of(energy, 1e-4), DECLARATION.membrane_stiffness
     s, states = jnp.asarray(attached() * STIFFNESS / (STIFFNESS + k)), []
     first = {lift.grasp: lift.tip for lift in lifts()[::-1]}
     predict = eqx.filter_jit(balance.predict)

@@ -96,14 +96,19 @@ def sheet_energy() -> SheetEnergy:
 
 @cache
 def sheet_balance(force_sd: float, force_level: float = np.inf) -> ForceBalance:
-    """Return the balance of forces that the implicit filter linearises, for forces in N.
+    """Return the balance of forces that the implicit filter linearises, for forces in N."""
+    return balance_of(sheet_energy(), force_sd, force_level)
+
+
+def balance_of(energy: SheetEnergy, force_sd: float, force_level: float = np.inf) -> ForceBalance:
+    """Return the balance of forces of the sheet with some energy.
 
     For data of its own model on its own mesh, no share of the forces is wrong: `force_level` is infinite.
     """
     k = DECLARATION.membrane_stiffness
     return ForceBalance.build(
         sheet(),
-        sheet_energy(),
+        energy,
         reference=k,
         force_sd=force_sd / FilterConfig().force_sd_floor,
         force_level=force_level,

@@ -69,6 +69,19 @@ def test_the_evidence_is_the_integral_over_stiffness_and_parameter(s):
     assert found == pytest.approx(by_quadrature(fitted), abs=2e-2)
 
 
+@pytest.mark.parametrize("s", [0.0, 0.2])
+def test_what_a_parameter_would_gain_by_a_step_counts_for_nothing(s):
+    """A fit that ended before its parameter was best; the slope in the stiffness is what the parameter leaves of it."""
+    sd = small_problem().prior_sd[0]
+    rows = np.array([[40.0, 3.0, 0.8], [5.0, -20.0, 1.5], [0.0, 4.0, -2.0]]) / [1, sd, 1]
+    with jax.enable_x64(True):
+        ended = fit_of(rows.T @ rows, s=s)
+        begun = replace(ended, point=replace(ended.point, theta=np.zeros(1)))
+        found = log_model_evidence(begun) - begun.problem.scales.log_prior()
+    gain = 0.5 * begun.square[-2, -1] ** 2 / (begun.square[-2, -2] + sd**-2)
+    assert gain > 1 and found == pytest.approx(by_quadrature(begun) - gain, abs=2e-2)
+
+
 def test_a_fit_without_a_finite_likelihood_has_no_evidence():
     with jax.enable_x64(True):
         fitted = fit_of(np.diag([40.0, 3.0, 1.0]), s=0.1)

@@ -82,6 +82,39 @@ def test_a_step_leads_to_a_lower_cost_or_nowhere(light):
         assert stepping.better_point(no_number, stepping.candidate_steps(begun)) is None
 
 
+def test_a_step_that_fails_as_a_whole_is_shortened(light, monkeypatch):
+    """Where the first two points that are tried are no better, the third is on the way to the first."""
+    fitted = light[0].declared.fits.assumed
+    problem, frames, free = fitted.problem, list(fitted.equations), np.zeros_like(fitted.point.s)
+    tried, real = [], stepping.weighed_with
+
+    def refusing(problem, point, weights):
+        tried.append(point)
+        there = real(problem, point, weights)
+        return there if len(tried) > stepping.MAX_WHOLE else dataclasses.replace(there, log_likelihood=-np.inf)
+
+    with jax.enable_x64(True), one_thread():
+        point = stepping.start(problem, fitted.point.theta, free, fitted.point.states, frames)
+        begun = stepping.linearise_at(problem, fitted.named, point, frames)
+        monkeypatch.setattr(stepping, "weighed_with", refusing)
+        better = stepping.better_point(begun, stepping.candidate_steps(begun))
+    assert better is not None and len(tried) == stepping.MAX_WHOLE + 1
+    np.testing.assert_allclose(better.point.s, stepping.SHORTER_SHARES[0] * tried[0].s, atol=1e-12)
+
+
+def test_an_effect_more_does_not_make_a_fit_less_likely(light):
+    """But for its prior at 0: with errors of the likeliest size it may begin where the fit without it ended."""
+    closed, _, dataset = light
+    problem, before = closed.problem, closed.final
+    used = {dataset.frames[k].part for k in before.fitted.equations}
+    named = np.append(before.fitted.named, problem.sheet.place("tool_scale"))
+    with jax.enable_x64(True), one_thread():
+        more = fit(problem, named, [before.fits.assumed.point], used, before=before.fits).likeliest
+        hopeless = fit(problem, named, [before.fits.assumed.point], used, before=before.fits, worth=np.inf)
+    assert more.log_posterior >= before.fitted.log_posterior - stepping.MIN_GAIN
+    assert hopeless.likeliest.log_posterior <= more.log_posterior
+
+
 def test_a_fit_without_a_part_uses_the_other_frames_alone(light):
     fitted = light[0].declared.fitted
     part = fitted.problem.history.frames[min(fitted.equations)].part

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from jiggle_mj.estimator.attribution.gauss_newton import linearise_at
-from jiggle_mj.estimator.attribution.likeliest_scales import LOG_RANGE, likeliest_scales
+from jiggle_mj.estimator.attribution.likeliest_scales import (
+    LOG_RANGE,
+    MAX_EVALUATIONS,
+    NEAR,
+    likeliest_scales,
+    maximum,
+)
 from jiggle_mj.estimator.attribution.noise_scales import NoiseScales, log_prior
 from jiggle_mj.estimator.blas import one_thread
 
@@ -44,3 +50,22 @@ def test_the_likeliest_variances_have_the_largest_posterior(light):
             assert within
             for changed in within:
                 assert log_posterior(replace(scales, **{name: changed})) < best, name
+
+
+@pytest.mark.parametrize("begun", [-2.0, 0.0, 3.0, 9.0])
+@pytest.mark.parametrize("at", [-2.5, -0.3, 1.0, 6.0, 12.0])
+def test_the_search_finds_the_maximum_of_a_skewed_function(begun, at):
+    """A likelihood falls exponentially below its likeliest variance, and linearly above it."""
+    tried = []
+
+    def log_likelihood(x: float) -> float:
+        tried.append(x)
+        return -500 * (np.exp(at - x) + x - at)
+
+    assert maximum(log_likelihood, begun) == pytest.approx(at, abs=NEAR)
+    assert len(tried) <= MAX_EVALUATIONS
+
+
+@pytest.mark.parametrize("slope, end", [(1.0, LOG_RANGE[1]), (-1.0, LOG_RANGE[0])])
+def test_the_search_ends_at_the_end_of_its_range(slope, end):
+    assert maximum(lambda x: slope * x, 0.0) == pytest.approx(end)
