@@ -1,7 +1,8 @@
 """Fit a hypothesis: stiffnesses, the parameters of its effects and the sizes of the errors, in turn.
 
 With errors of the assumed size the fit comes first, because with errors as large as the residual of a wrong start the
-frames say little. From there the sizes are estimated too.
+frames say little. From there the sizes are estimated too. A fit with one effect more also begins at the likeliest one
+without it, and the likelier end counts.
 """
 
 from collections.abc import Callable
@@ -67,17 +68,24 @@ def fit(
     begun = [weighed_with(problem, point, weighed(problem, point, frames)) for point in starts]
     begun += [] if before is None else [before.assumed]
     likelihoods = np.nan_to_num([one.log_likelihood for one in begun], nan=-np.inf)
-    assumed = now = gauss_newton(linearised_fit(begun[int(np.argmax(likelihoods))], named), log=log)
-    near = None if before is None else before.likeliest.problem.scales
+    assumed = gauss_newton(linearised_fit(begun[int(np.argmax(likelihoods))], named), log=log)
+    likeliest = _with_scales(assumed, None if before is None else before.likeliest.problem.scales, worth, log)
+    if before is not None:
+        begun_there = linearised_fit(before.likeliest, named)
+        if begun_there.log_posterior + largest_predicted_gain(begun_there) / 2 > max(worth, likeliest.log_posterior):
+            other = _with_scales(gauss_newton(begun_there, log=log), None, worth, log)
+            likeliest = max(likeliest, other, key=lambda one: one.log_posterior)
+    return Fits(assumed=assumed, likeliest=likeliest)
+
+
+def _with_scales(now: Fitted, near: NoiseScales | None, worth: float, log: Callable[[str], None]) -> Fitted:
+    """Return the fit with errors of the likeliest size, from one with others; `near` is where their search begins."""
     for count in range(MAX_SCALES):
         now, settled = _with_likeliest_scales(now, near if count == 0 else None, log)
-        if count == 0 and before is not None:
-            other = linearised_fit(before.likeliest, named)
-            now, settled = (other, False) if other.log_posterior > now.log_posterior else (now, settled)
         if settled or not now.log_posterior + largest_predicted_gain(now) / 2 > worth:
             break
         now = gauss_newton(now, log=log)
-    return Fits(assumed=assumed, likeliest=now)
+    return now
 
 
 def _with_likeliest_scales(now: Fitted, near: NoiseScales | None, log: Callable[[str], None]) -> tuple[Fitted, bool]:

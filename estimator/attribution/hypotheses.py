@@ -26,7 +26,7 @@ BEAM = 3
 REACH = 3.0
 """Difference of log posterior from the best up to which hypotheses are searched on from [nat]: a twentieth of its
 probability, less than what the credible set leaves out."""
-HOPELESS = 50.0
+HOPELESS = 200.0
 """Difference of the log posterior of fits from which one is not fitted to its end [nat]: its share is too small."""
 N_FITTED = 4
 """Number of effects that are fitted in addition to a hypothesis, the likeliest by their scores."""

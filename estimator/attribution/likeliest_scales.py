@@ -76,27 +76,42 @@ def maximum(function: Callable[[float], float], begun: float) -> float:
     """Return where a log likelihood has its maximum over the logarithm of a variance, within its range.
 
     It falls exponentially below its maximum and linearly above it, as that of Gaussian residuals does. So the search
-    goes to where the function -(a exp(-x) + b x) / 2 through three places has its maximum.
+    goes to where the function -(a exp(-x) + b x) / 2 through three places has its maximum. Where the variance is so
+    small that the frames' matrices are singular to rounding, the function is no number; there the range ends.
     """
-    begun = float(np.clip(begun, LOG_RANGE[0] + STEP, LOG_RANGE[1] - STEP))
+    lowest, highest = LOG_RANGE
+    begun = float(np.clip(begun, lowest + STEP, highest - STEP))
     found = {x: function(x) for x in (begun - STEP, begun, begun + STEP)}
-    while len(found) < MAX_EVALUATIONS:
+    while not all(map(np.isfinite, found.values())):
+        lowest, above = min(found) + STEP / 2, max(found) + STEP
+        if above > highest:
+            return begun
+        found = {x: value for x, value in found.items() if x > lowest} | {above: function(above)}
+    for _ in range(MAX_EVALUATIONS - len(found)):
         places = sorted(found)
-        best = int(np.argmax([found[x] for x in places]))
-        middle = min(max(best, 1), len(places) - 2)
-        around = np.array(places[middle - 1 : middle + 2])
-        columns = np.column_stack([np.diff(np.exp(-around)), np.diff(around)])
-        a, b = np.linalg.solve(columns, -2 * np.diff([found[x] for x in around]))
-        if a > 0 and b > 0:
-            following = float(np.log(a / b))
-        else:
-            other_end = places[-1] if best == 0 else places[0]
-            following = 2 * places[best] - other_end if best != middle else float(np.mean(around[:2]))
-        following = float(np.clip(following, *LOG_RANGE))
+        following = float(np.clip(_following(places, [found[x] for x in places]), lowest, highest))
         if min(abs(following - x) for x in places) < NEAR:
-            return following
-        found[following] = function(following)
+            return float(np.clip(following, places[0], places[-1]))
+        value = function(following)
+        if np.isfinite(value):
+            found[following] = value
+        else:
+            lowest = (following + places[0]) / 2
     return max(found, key=lambda x: found[x])
+
+
+def _following(places: list[float], values: list[float]) -> float:
+    """Return the place to try next, of places in order and their values."""
+    best = int(np.argmax(values))
+    middle = min(max(best, 1), len(places) - 2)
+    around = np.array(places[middle - 1 : middle + 2])
+    columns = np.column_stack([np.diff(np.exp(-around)), np.diff(around)])
+    a, b = np.linalg.solve(columns, -2 * np.diff(values[middle - 1 : middle + 2]))
+    if a > 0 and b > 0:
+        return float(np.log(a / b))
+    if best == middle:
+        return float(np.mean(around[:2]))
+    return 2 * places[best] - (places[-1] if best == 0 else places[0])
 
 
 def _largest(log_likelihood: Callable[[float], float]) -> tuple[float, float]:

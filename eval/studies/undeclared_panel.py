@@ -50,6 +50,8 @@ from jiggle_mj.scenes.disturbances.world import Bed, Friction, Gravity, ViscousD
 from jiggle_mj.scenes.scene.attachments import Attachment
 from jiggle_mj.scenes.scene.disturbance import Disturbance
 
+from .coarse_layouts import LAYOUTS, on_coarse_sheet
+
 AFTER_STILL_FRAMES = 2.2
 """Start of effects that would otherwise be in the rest shape: after the still frames, before the first grasp [s]."""
 UNSETTLED = Inertia(magnitude=0.02)
@@ -89,6 +91,8 @@ class PanelRow:
     """Names of the disturbances in the library of effects; none where the library lacks them."""
     layout: str = "arc"
     """Name of the shipped scene whose attachments the row has."""
+    coarse_layout: str | None = None
+    """Name of a layout on the coarse sheet, in place of that; see `coarse_layouts`."""
     sensing: Sensing = "particles"
     spacing: float = COARSE_SPACING
     """Edge length of the reference's mesh [m]; particles are its vertices, and points do not depend on it."""
@@ -203,8 +207,23 @@ NOTHING: dict[str, PanelRow] = {
     "nothing, disc": PanelRow(layout="large_attach"),
 }
 """Rows without an undeclared effect: whatever is named there is a false alarm."""
-GROUPS = {"inside": INSIDE, "together": TOGETHER, "images": IMAGES, "outside": OUTSIDE, "nothing": NOTHING}
+ON_LAYOUTS: dict[str, PanelRow] = {
+    f"{name}, {layout}": replace(row, coarse_layout=layout)
+    for layout in LAYOUTS
+    for name, row in {**INSIDE, "nothing": PanelRow()}.items()
+}
+"""Rows of one effect, and one of nothing, on each layout of the coarse sheet."""
+GROUPS = {
+    "inside": INSIDE,
+    "together": TOGETHER,
+    "images": IMAGES,
+    "outside": OUTSIDE,
+    "nothing": NOTHING,
+    "layouts": ON_LAYOUTS,
+}
 ROWS = {name: row for rows in GROUPS.values() for name, row in rows.items()}
+USUAL_GROUPS = tuple(group for group in GROUPS if group != "layouts")
+"""Groups that are run if none are chosen: the layouts are six times as many rows."""
 
 
 def scene_with(name: str, seed: int) -> Scene:
@@ -234,7 +253,7 @@ def scene_with(name: str, seed: int) -> Scene:
         smooth_length=SMOOTH_LENGTH,
         n_points=N_POINTS,
     )
-    return replace(
+    scene = replace(
         arc,
         name=f"undeclared, {name}",
         seed=seed,
@@ -247,6 +266,7 @@ def scene_with(name: str, seed: int) -> Scene:
         sensing=noise,
         disturbances=row.disturbances,
     )
+    return scene if row.coarse_layout is None else on_coarse_sheet(scene, row.coarse_layout, seed)
 
 
 def _coarser(attachment: Attachment) -> Attachment:

@@ -18,8 +18,20 @@ from jiggle_mj.scenes import Reference, programme
 from ..metrics.result_file import MADE_BY, read_json
 from ..runs.closing_the_loop import DISCREPANCY, close_loop
 from ..runs.compiled_functions import drop_many_compiled
+from .coarse_layouts import rough_bed
 from .study import Study, Table
-from .undeclared_panel import IMAGES, INSIDE, NOTHING, OUTSIDE, ROWS, TOGETHER, PanelRow, scene_with
+from .undeclared_panel import (
+    GROUPS,
+    IMAGES,
+    INSIDE,
+    ON_LAYOUTS,
+    OUTSIDE,
+    ROWS,
+    TOGETHER,
+    USUAL_GROUPS,
+    PanelRow,
+    scene_with,
+)
 
 COVERAGE = 0.95
 """Probability that the intervals of an effect's parameters are meant to hold."""
@@ -45,7 +57,7 @@ class UndeclaredStudy(Study[UndeclaredCell, Discrepancy]):
     """Study of undeclared effects."""
 
     default_seeds: ClassVar[range] = range(5)
-    rows: tuple[str, ...] = tuple(ROWS)
+    rows: tuple[str, ...] = tuple(row for group in USUAL_GROUPS for row in GROUPS[group])
     """Names of the panel's rows."""
 
     def cells(self, seeds: Iterable[int]) -> tuple[UndeclaredCell, ...]:
@@ -99,6 +111,16 @@ class UndeclaredStudy(Study[UndeclaredCell, Discrepancy]):
         )
 
 
+def _added(found: Discrepancy) -> set[str]:
+    """Return the effects that a run adds."""
+    return {effect["name"] for effect in found["effects"]}
+
+
+def _unlisted(cell: UndeclaredCell) -> set[str]:
+    """Return the effects that a cell has and its row does not list: a rough bed under the coarse sheet."""
+    return {"friction"} if ROWS[cell.row].coarse_layout is not None and rough_bed(cell.seed) else set()
+
+
 def named(found: Discrepancy) -> list[str]:
     """Return the effects that a run names, and those that the data cannot distinguish from them."""
     return [effect["name"] for effect in found["effects"]] + found["ambiguous_with"]
@@ -109,12 +131,15 @@ Runs = list[tuple[PanelRow, Discrepancy]]
 
 def _sums(results: Mapping[UndeclaredCell, Discrepancy]) -> list[str]:
     sentences = []
-    for what, rows in (("One effect", INSIDE), ("Two effects", TOGETHER), ("One effect, from images", IMAGES)):
+    on_layouts = {name: row for name, row in ON_LAYOUTS.items() if row.effects}
+    groups = (("One effect", INSIDE), ("Two effects", TOGETHER), ("One effect, from images", IMAGES))
+    for what, rows in (*groups, ("One effect, on several layouts", on_layouts)):
         if runs := [(ROWS[cell.row], found) for cell, found in results.items() if cell.row in rows]:
             gained = _gained([found for _, found in runs])
             sentences.append(f"{what}: {_right(runs)}; {gained}; {_covered(runs)}.")
-    if nothing := [found for cell, found in results.items() if cell.row in NOTHING]:
-        named_runs = sum(bool(found["effects"]) for found in nothing)
+    nothing = {cell: f for cell, f in results.items() if not (ROWS[cell.row].effects or cell.row in OUTSIDE)}
+    if nothing:
+        named_runs = sum(bool(_added(found) - _unlisted(cell)) for cell, found in nothing.items())
         sentences.append(f"Nothing undeclared: {named_runs} of {len(nothing)} named.")
     if outside := [found for cell, found in results.items() if cell.row in OUTSIDE]:
         honest = sum(found["verdict"] in UNEXPLAINED for found in outside)
@@ -124,7 +149,7 @@ def _sums(results: Mapping[UndeclaredCell, Discrepancy]) -> list[str]:
 
 def _right(runs: Runs) -> str:
     """Say how often each effect of a row was added, and how often it was among those named."""
-    added = sum({effect["name"] for effect in found["effects"]} >= set(row.effects) for row, found in runs)
+    added = sum(_added(found) >= set(row.effects) for row, found in runs)
     first = sum(found["effects"][:1] != [] and found["effects"][0]["name"] in row.effects for row, found in runs)
     among = sum(set(named(found)) >= set(row.effects) for row, found in runs)
     return f"named first in {first} of {len(runs)}, all added in {added}, all among those named in {among}"

@@ -12,7 +12,7 @@ from ..recording.pairing import MAX_PAIRING_TOLERANCE_MS
 PathArgument = Annotated[Path, tyro.conf.Positional]
 PathArguments = Annotated[tuple[Path, ...], tyro.conf.Positional]
 Name = Annotated[str, tyro.conf.Positional]
-RowsName = Literal["inside", "together", "images", "outside", "nothing"]
+RowsName = Literal["inside", "together", "images", "outside", "nothing", "layouts"]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 AsJson = Annotated[bool, tyro.conf.arg(name="json")]
 SchedulerUrl = Annotated[str | None, tyro.conf.arg(metavar="dask://HOST:PORT")]

@@ -83,16 +83,16 @@ class _Undeclared(_TableOptions):
     seeds: tuple[int, ...] | None = None
     """Seeds of each row; 0 to 4 if left out."""
     rows: tuple[RowsName, ...] | None = None
-    """Rows of the panel: one effect of the library, two together, one from images, what is outside the library, or
-    nothing; all if left out."""
+    """Rows of the panel: one effect of the library, two together, one from images, what is outside the library,
+    nothing, or one effect on each of six layouts of a coarse sheet; all but the last if left out."""
     jobs: int | None = None
     """Number of runs at a time; the number of usable cores if left out."""
 
     def run(self) -> None:
-        from jiggle_mj.eval.studies.undeclared_panel import GROUPS
+        from jiggle_mj.eval.studies.undeclared_panel import GROUPS, USUAL_GROUPS
         from jiggle_mj.eval.studies.undeclared_table import UndeclaredStudy
 
-        rows = tuple(row for group in self.rows or GROUPS for row in GROUPS[group])
+        rows = tuple(row for group in self.rows or USUAL_GROUPS for row in GROUPS[group])
         _print_table(UndeclaredStudy(rows=rows), self, self.seeds, self.jobs, parallel=True)
 
 

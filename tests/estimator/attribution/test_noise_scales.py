@@ -11,6 +11,7 @@ from jiggle_mj.estimator.attribution.likeliest_scales import (
     LOG_RANGE,
     MAX_EVALUATIONS,
     NEAR,
+    STEP,
     likeliest_scales,
     maximum,
 )
@@ -69,3 +70,10 @@ def test_the_search_finds_the_maximum_of_a_skewed_function(begun, at):
 @pytest.mark.parametrize("slope, end", [(1.0, LOG_RANGE[1]), (-1.0, LOG_RANGE[0])])
 def test_the_search_ends_at_the_end_of_its_range(slope, end):
     assert maximum(lambda x: slope * x, 0.0) == pytest.approx(end)
+
+
+@pytest.mark.parametrize("least", [-2.0, -0.5, 2.0])
+def test_the_search_keeps_to_where_the_function_is_a_number(least):
+    found = maximum(lambda x: -x if x > least else np.nan, 0.0)
+    assert least < found < least + 2 * STEP
+    assert maximum(lambda x: np.nan, 1.0) == 1.0

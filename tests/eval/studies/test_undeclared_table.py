@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import get_args
 
@@ -16,7 +17,6 @@ from jiggle_mj.eval.runs.closing_the_loop import DISCREPANCY
 from jiggle_mj.eval.studies.study import run_study
 from jiggle_mj.eval.studies.undeclared_panel import (
     GROUPS,
-    NOTHING,
     OUTSIDE,
     ROWS,
     SHIPPED_SPACING,
@@ -26,7 +26,8 @@ from jiggle_mj.eval.studies.undeclared_panel import (
 )
 from jiggle_mj.eval.studies.undeclared_table import UndeclaredCell, UndeclaredStudy
 from jiggle_mj.recording.declaration import VERSION, file_metadata
-from jiggle_mj.scenes import load_scene
+from jiggle_mj.scenes import Reference, load_scene
+from jiggle_mj.scenes.scene.programme import opening
 
 
 def found(
@@ -51,11 +52,14 @@ def found(
 
 def test_scenes_differ_by_what_is_undeclared_alone_and_keep_it_secret():
     assert scene_with("nothing", 0).disturbances == ()
-    plain = {(row.layout, row.spacing): scene_with(name, 0).attachments for name, row in NOTHING.items()}
+    nothing = {name: row for name, row in ROWS.items() if name.startswith("nothing")}
+    plain = {
+        (row.layout, row.coarse_layout, row.spacing): scene_with(name, 0).attachments for name, row in nothing.items()
+    }
     for name, row in ROWS.items():
         scene = scene_with(name, 0)
         assert len(scene.disturbances) == max(len(row.effects), name in OUTSIDE) + (UNSETTLED in scene.disturbances)
-        assert scene.secret and scene.attachments == plain[row.layout, row.spacing]
+        assert scene.secret and scene.attachments == plain[row.layout, row.coarse_layout, row.spacing]
 
 
 def test_attachments_are_as_shipped_on_a_mesh_as_fine_as_there_and_wider_and_stiffer_on_a_coarser_one():
@@ -64,6 +68,16 @@ def test_attachments_are_as_shipped_on_a_mesh_as_fine_as_there_and_wider_and_sti
     assert scene_with("nothing, images", 0).attachments == shipped
     assert coarser == replace(shipped[0], width=0.0115, stiffness=2.0)
     assert len(scene_with("nothing, U shape", 0).attachments) == 3
+
+
+def test_undeclared_effects_begin_after_the_still_frames_and_before_the_jaws_close():
+    """Or at once. On the coarse sheet too, where an earlier panel let some begin in the middle of the first grasp."""
+    for name in ("camera bias", "camera bias, three bars"):
+        scene = scene_with(name, 1)
+        with Reference(scene, seed=1, sensing="particles") as reference:
+            seen = [reference.step(action) for action in islice(opening(scene), scene.programme.still_frames + 1)]
+        assert [one.tool.closed for one in seen[-2:]] == [False, True]
+        assert 0 < scene.disturbances[0].start < seen[-1].time / 1e9
 
 
 def test_every_row_has_a_name_of_its_own():
