@@ -30,7 +30,7 @@ def log_model_evidence(fitted: Fitted) -> float:
     precision, slope = np.asarray(joint.precision), np.asarray(joint.shift)
     of_theta = precision[n:, n:][np.ix_(inside, inside)]
     beside = precision[:n, n:][:, inside]
-    # what the parameters leave of the slope in s; their own counts for nothing, as no step along it was found better
+    # what the parameters leave of the slope in s; their own counts for nothing, as the fit did not go along it
     solved = np.linalg.solve(of_theta, np.column_stack([beside.T, slope[n:][inside]]))
     information, shift = precision[:n, :n] - beside @ solved[:, :-1], slope[:n] - beside @ solved[:, -1]
     scaled = of_theta * np.outer(sd[inside], sd[inside])

@@ -82,7 +82,8 @@ class Fitted(Weighed):
     @property
     def log_posterior(self) -> float:
         """Return the logarithm of likelihood and prior, of the noise scales too [nat]; -inf where it is no number."""
-        return float(np.nan_to_num(self.problem.scales.log_prior() - self.cost / 2, nan=-np.inf))
+        found = self.problem.scales.log_prior() - self.cost / 2
+        return found if np.isfinite(found) else -np.inf
 
     @property
     def belief(self) -> AttachmentBelief:
@@ -195,8 +196,8 @@ def better_point(now: Fitted, steps: list[Step]) -> Weighed | None:
 
 
 def largest_predicted_gain(now: Fitted) -> float:
-    """Return by how much the cost falls in the best whole step, as the normal equations predict it [nat, doubled]."""
-    return max(_predicted_gain(now, *_apply(now, step, 1.0)) for step in candidate_steps(now))
+    """Return by how much the cost falls in the best whole step or in none, by the normal equations [nat, doubled]."""
+    return max(0.0, *(_predicted_gain(now, *_apply(now, step, 1.0)) for step in candidate_steps(now)))
 
 
 def _apply(now: Fitted, step: Step, share: float) -> Step:

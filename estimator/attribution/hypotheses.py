@@ -170,11 +170,13 @@ def added_to(
 
 
 def left_out(last: Hypothesis, one: AddedEffect, used: set[int], log: Log) -> Hypothesis:
-    """Return a hypothesis without one of its effects, fitted again; to its end only if it may be nearly as likely."""
+    """Return a hypothesis without one of its effects, fitted again; to its end only if not hopeless."""
     begun = last.fits.assumed
     named = begun.named[~np.isin(begun.named, one.at)]
     worth = last.fitted.log_posterior - HOPELESS
-    fits = fit(begun.problem, named, [moved(begun, one.at, np.zeros(len(one.at)))], used, worth=worth)
+    fits = fit(
+        begun.problem, named, [moved(begun, one.at, np.zeros(len(one.at)))], used, before=last.path[0].fits, worth=worth
+    )
     result = hypothesis_of(fits, tuple(other for other in last.added if other is not one), last.path[0])
     _report(result, log)
     return result

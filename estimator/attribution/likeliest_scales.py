@@ -81,27 +81,29 @@ def maximum(function: Callable[[float], float], begun: float) -> float:
     """
     lowest, highest = LOG_RANGE
     begun = float(np.clip(begun, lowest + STEP, highest - STEP))
-    found = {x: function(x) for x in (begun - STEP, begun, begun + STEP)}
-    while not all(map(np.isfinite, found.values())):
-        lowest, above = min(found) + STEP / 2, max(found) + STEP
-        if above > highest:
-            return begun
-        found = {x: value for x, value in found.items() if x > lowest} | {above: function(above)}
-    for _ in range(MAX_EVALUATIONS - len(found)):
-        places = sorted(found)
-        following = float(np.clip(_following(places, [found[x] for x in places]), lowest, highest))
-        if min(abs(following - x) for x in places) < NEAR:
-            return float(np.clip(following, places[0], places[-1]))
+    found: dict[float, float] = {}
+    following = begun + STEP
+    for _ in range(MAX_EVALUATIONS):
         value = function(following)
         if np.isfinite(value):
             found[following] = value
         else:
-            lowest = (following + places[0]) / 2
-    return max(found, key=lambda x: found[x])
+            lowest = max(lowest, following + NEAR)
+        places = sorted(found)
+        if len(places) < 3:
+            outwards = [x for x in (begun, begun - STEP) if x > lowest and x not in found]
+            following = outwards[0] if outwards else max([lowest, *places]) + STEP
+            if following > highest:
+                break
+            continue
+        following = float(np.clip(_following(places, [found[x] for x in places]), lowest, highest))
+        if min(abs(following - x) for x in places) < NEAR:
+            return float(np.clip(following, places[0], places[-1]))
+    return max(found, key=lambda x: found[x], default=begun)
 
 
 def _following(places: list[float], values: list[float]) -> float:
-    """Return the place to try next, of places in order and their values."""
+    """Return the place to try next, of three or more places in order and their values."""
     best = int(np.argmax(values))
     middle = min(max(best, 1), len(places) - 2)
     around = np.array(places[middle - 1 : middle + 2])
@@ -109,8 +111,6 @@ def _following(places: list[float], values: list[float]) -> float:
     a, b = np.linalg.solve(columns, -2 * np.diff(values[middle - 1 : middle + 2]))
     if a > 0 and b > 0:
         return float(np.log(a / b))
-    if best == middle:
-        return float(np.mean(around[:2]))
     return 2 * places[best] - (places[-1] if best == 0 else places[0])
 
 
@@ -127,7 +127,7 @@ def _largest(log_likelihood: Callable[[float], float]) -> tuple[float, float]:
 def _misfit(fitted: Fitted, force: float) -> _Misfit:
     """Return the residuals of a fit under another variance of force errors."""
     problem = fitted.problem
-    same = force == problem.scales.force
+    same = np.isclose(force, problem.scales.force, rtol=1e-12, atol=0)
     problem = problem.with_scales(replace(problem.scales, force=force))
     weights = fitted.weights if same else weighed(problem, fitted.point, list(fitted.weights))
     every = residual(problem, weights, fitted.point)

@@ -110,7 +110,10 @@ def _score(
 
 
 def _from_initial_guesses(fitted: Fitted, score: Score) -> Score:
-    """Return an effect's score, or that of a few steps from its best initial guess, if that is larger."""
+    """Return an effect's score, or that of a few steps from its best initial guess, if that is larger.
+
+    The steps are taken only where the normal equations there promise more than the score, and enough to fit the effect.
+    """
     problem = fitted.problem
     effect = problem.sheet.effect(score.name)
     if not effect.initial_guesses:

@@ -21,8 +21,12 @@ MEMBRANE_STIFFNESS = 30.0
 """Young's modulus times thickness [N/m]."""
 DENSITY = 1000.0
 """Density of the sheet [kg/m^3]."""
-ROUGH_EVERY, ROUGH, SMOOTH = 3, 0.3, 0.1
-"""Every third seed's bed has the first coefficient of friction, which nobody declares, the others' the second."""
+ROUGH_EVERY, ROUGH = 3, 0.3
+"""The bed of every third seed has this coefficient of friction, which nobody declares."""
+JAW_RADIUS, LIFT_HEIGHT, INCREMENTS = 9.5e-3, 0.032, 4
+"""Radius of the jaws [m], height of a lift [m], and its increments."""
+MESH_SEEDS = (7, 8)
+"""Seeds of the reference's mesh for even and for odd seeds."""
 
 
 def _bar(start: tuple[float, float], end: tuple[float, float], stiffness: float) -> Segment:
@@ -74,14 +78,14 @@ def on_coarse_sheet(scene: Scene, layout: str, seed: int) -> Scene:
         scene,
         tissue=replace(
             scene.tissue,
-            seed=7 + seed % 2,
+            seed=MESH_SEEDS[seed % len(MESH_SEEDS)],
             spacing=SPACING,
             thickness=thickness,
             young=MEMBRANE_STIFFNESS / thickness,
         ),
-        programme=replace(scene.programme, points=corners, increments=4, height=0.032),
+        programme=replace(scene.programme, points=corners, increments=INCREMENTS, height=LIFT_HEIGHT),
         attachments=LAYOUTS[layout],
-        tweezer=replace(scene.tweezer, radius=9.5e-3),
+        tweezer=replace(scene.tweezer, radius=JAW_RADIUS),
         declared=replace(scene.declared, thickness=thickness, areal_density=DENSITY * thickness),
-        bed=replace(scene.bed, friction=ROUGH if rough_bed(seed) else SMOOTH),
+        bed=replace(scene.bed, friction=ROUGH if rough_bed(seed) else scene.bed.friction),
     )

@@ -95,7 +95,8 @@ class PanelRow:
     """Name of a layout on the coarse sheet, in place of that; see `coarse_layouts`."""
     sensing: Sensing = "particles"
     spacing: float = COARSE_SPACING
-    """Edge length of the reference's mesh [m]; particles are its vertices, and points do not depend on it."""
+    """Edge length of the reference's mesh [m], but on the coarse sheet; particles are its vertices, and points do not
+    depend on it."""
     smooth_share: float = 0.5
     """Share of the noise's variance that neighbours share."""
     sizes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -207,10 +208,13 @@ NOTHING: dict[str, PanelRow] = {
     "nothing, disc": PanelRow(layout="large_attach"),
 }
 """Rows without an undeclared effect: whatever is named there is a false alarm."""
+OF_ANCHORS = {"anchor_shift", "anchor_creep", "anchor_yield", "substrate"}
+"""Effects that a sheet without attachments cannot have."""
 ON_LAYOUTS: dict[str, PanelRow] = {
     f"{name}, {layout}": replace(row, coarse_layout=layout)
-    for layout in LAYOUTS
+    for layout, attachments in LAYOUTS.items()
     for name, row in {**INSIDE, "nothing": PanelRow()}.items()
+    if attachments or not OF_ANCHORS & set(row.effects)
 }
 """Rows of one effect, and one of nothing, on each layout of the coarse sheet."""
 GROUPS = {
@@ -223,7 +227,7 @@ GROUPS = {
 }
 ROWS = {name: row for rows in GROUPS.values() for name, row in rows.items()}
 USUAL_GROUPS = tuple(group for group in GROUPS if group != "layouts")
-"""Groups that are run if none are chosen: the layouts are six times as many rows."""
+"""Groups that are run if none are chosen: the layouts have more rows than all others together."""
 
 
 def scene_with(name: str, seed: int) -> Scene:

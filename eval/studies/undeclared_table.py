@@ -116,9 +116,16 @@ def _added(found: Discrepancy) -> set[str]:
     return {effect["name"] for effect in found["effects"]}
 
 
-def _unlisted(cell: UndeclaredCell) -> set[str]:
-    """Return the effects that a cell has and its row does not list: a rough bed under the coarse sheet."""
-    return {"friction"} if ROWS[cell.row].coarse_layout is not None and rough_bed(cell.seed) else set()
+def _listed(cell: UndeclaredCell, found: Discrepancy) -> Discrepancy:
+    """Return what a run found, without the friction of a rough bed where its row does not list it."""
+    row = ROWS[cell.row]
+    if row.coarse_layout is None or not rough_bed(cell.seed) or "friction" in row.effects:
+        return found
+    return {
+        **found,
+        "effects": [effect for effect in found["effects"] if effect["name"] != "friction"],
+        "ambiguous_with": [name for name in found["ambiguous_with"] if name != "friction"],
+    }
 
 
 def named(found: Discrepancy) -> list[str]:
@@ -134,12 +141,16 @@ def _sums(results: Mapping[UndeclaredCell, Discrepancy]) -> list[str]:
     on_layouts = {name: row for name, row in ON_LAYOUTS.items() if row.effects}
     groups = (("One effect", INSIDE), ("Two effects", TOGETHER), ("One effect, from images", IMAGES))
     for what, rows in (*groups, ("One effect, on several layouts", on_layouts)):
-        if runs := [(ROWS[cell.row], found) for cell, found in results.items() if cell.row in rows]:
+        if runs := [(ROWS[cell.row], _listed(cell, found)) for cell, found in results.items() if cell.row in rows]:
             gained = _gained([found for _, found in runs])
             sentences.append(f"{what}: {_right(runs)}; {gained}; {_covered(runs)}.")
-    nothing = {cell: f for cell, f in results.items() if not (ROWS[cell.row].effects or cell.row in OUTSIDE)}
+    nothing = {
+        cell: _listed(cell, found)
+        for cell, found in results.items()
+        if not (ROWS[cell.row].effects or cell.row in OUTSIDE)
+    }
     if nothing:
-        named_runs = sum(bool(_added(found) - _unlisted(cell)) for cell, found in nothing.items())
+        named_runs = sum(bool(_added(found)) for found in nothing.values())
         sentences.append(f"Nothing undeclared: {named_runs} of {len(nothing)} named.")
     if outside := [found for cell, found in results.items() if cell.row in OUTSIDE]:
         honest = sum(found["verdict"] in UNEXPLAINED for found in outside)

@@ -84,7 +84,7 @@ class _Undeclared(_TableOptions):
     """Seeds of each row; 0 to 4 if left out."""
     rows: tuple[RowsName, ...] | None = None
     """Rows of the panel: one effect of the library, two together, one from images, what is outside the library,
-    nothing, or one effect on each of six layouts of a coarse sheet; all but the last if left out."""
+    nothing, or one effect or nothing on each of six layouts of a coarse sheet; all but the last if left out."""
     jobs: int | None = None
     """Number of runs at a time; the number of usable cores if left out."""
 

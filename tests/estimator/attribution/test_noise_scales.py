@@ -74,6 +74,12 @@ def test_the_search_ends_at_the_end_of_its_range(slope, end):
 
 @pytest.mark.parametrize("least", [-2.0, -0.5, 2.0])
 def test_the_search_keeps_to_where_the_function_is_a_number(least):
-    found = maximum(lambda x: -x if x > least else np.nan, 0.0)
-    assert least < found < least + 2 * STEP
+    tried = []
+
+    def falling(x: float) -> float:
+        tried.append(x)
+        return -x if x > least else np.nan
+
+    assert least < maximum(falling, 0.0) < least + 2 * STEP
+    assert len(tried) <= MAX_EVALUATIONS
     assert maximum(lambda x: np.nan, 1.0) == 1.0
