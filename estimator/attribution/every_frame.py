@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -60,7 +59,7 @@ def log_determinants(problem: Problem, weights: dict[int, FrameLikelihood]) -> f
         among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
         with np.errstate(invalid="ignore"):  # where a point has no finite weights, the caller refuses it
             total += float(np.linalg.slogdet(np.eye(N_FIELDS) + problem.amplitude**2 * among)[1])
-    every = parallel_map(lambda k: float(_log_determinant(weights[k])), weights)
+    every = parallel_map(lambda k: float(weights[k].log_determinant()), weights)
     return total + sum(every.values())
 
 
@@ -85,12 +84,6 @@ def misfit_of(problem: Problem, weights: dict[int, FrameLikelihood], every: dict
         total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0] / problem.scales.tool
         total -= fields @ np.linalg.solve(among + np.eye(N_FIELDS) / problem.amplitude**2, fields)
     return float(total)
-
-
-@eqx.filter_jit
-def _log_determinant(likelihood: FrameLikelihood) -> Float[Array, ""]:
-    """Return a frame's log determinant as a compiled program."""
-    return likelihood.log_determinant()
 
 
 def _each(

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .every_frame import weighed
 from .gauss_newton import (
     Fitted,
     better_point,
@@ -21,6 +20,7 @@ from .gauss_newton import (
     largest_predicted_gain,
     linearise_at,
     linearised_fit,
+    weigh,
     weighed_with,
 )
 from .likeliest_scales import likeliest_scales
@@ -65,7 +65,7 @@ def fit(
     """
     frames = problem.frames(parts)
     problem = problem.with_scales(NoiseScales())
-    begun = [weighed_with(problem, point, weighed(problem, point, frames)) for point in starts]
+    begun = [weigh(problem, point, frames) for point in starts]
     begun += [] if before is None else [before.assumed]
     likelihoods = np.nan_to_num([one.log_likelihood for one in begun], nan=-np.inf)
     assumed = gauss_newton(linearised_fit(begun[int(np.argmax(likelihoods))], named), log=log)

@@ -76,6 +76,7 @@ class FrameLikelihood(eqx.Module):
         """Return the forces H (y - h(x)) of a residual of positions y - h(x) [m]."""
         return self.balance.apply(self.frame.dr_dx, self.seen[:, None] * residual)
 
+    @eqx.filter_jit
     def log_determinant(self) -> Float[Array, ""]:
         """Return ln |C| of the observed positions' covariance C, up to the precision of their white noise.
 
@@ -83,6 +84,7 @@ class FrameLikelihood(eqx.Module):
         """
         return self.force_log_determinant() - self._log_det_of_square()
 
+    @eqx.filter_jit
     def force_log_determinant(self) -> Float[Array, ""]:
         """Return ln |N + H F F^T H^T|, up to the same: all that changes with the variances at a given H."""
         w, known = self.frame.weight, self.frame.weight > 0

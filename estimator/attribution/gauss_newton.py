@@ -139,6 +139,11 @@ def gauss_newton(
     return now
 
 
+def weigh(problem: Problem, point: Point, frames: list[int]) -> Weighed:
+    """Return a point with the weights of some frames there."""
+    return weighed_with(problem, point, weighed(problem, point, frames))
+
+
 def weighed_with(problem: Problem, point: Point, weights: dict[int, FrameLikelihood]) -> Weighed:
     """Return a point with the weights that it has."""
     doubled = misfit_under(problem, weights, point) + log_determinants(problem, weights)
@@ -147,7 +152,7 @@ def weighed_with(problem: Problem, point: Point, weights: dict[int, FrameLikelih
 
 def linearise_at(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> Fitted:
     """Return a point as a fit, with weights, normal equations and posterior there."""
-    return linearised_fit(weighed_with(problem, point, weighed(problem, point, frames)), named)
+    return linearised_fit(weigh(problem, point, frames), named)
 
 
 def linearised_fit(at: Weighed, named: np.ndarray) -> Fitted:
@@ -169,7 +174,7 @@ def fit_at(at: Weighed, named: np.ndarray, equations: dict[int, NormalEquations]
         square=square,
         equations=equations,
         weights=at.weights,
-        summary=_summary(problem, square, point, free, sd),
+        summary=posterior(problem, square, point, free, sd),
         log_likelihood=at.log_likelihood,
     )
 
@@ -189,7 +194,7 @@ def better_point(now: Fitted, steps: list[Step]) -> Weighed | None:
     for step, share in [*((step, 1.0) for step in whole[:MAX_WHOLE]), *shorter]:
         theta, s = _apply(now, step, share)
         point = start(now.problem, theta, s, now.point.states, list(now.equations))
-        there = weighed_with(now.problem, point, weighed(now.problem, point, list(now.equations)))
+        there = weigh(now.problem, point, list(now.equations))
         if _cost(now.problem, now.named, point, there.log_likelihood) < now.cost - MIN_GAIN:
             return there
     return None
@@ -205,7 +210,7 @@ def _apply(now: Fitted, step: Step, share: float) -> Step:
     free, sd = now.free, now.problem.sd(now.named)
     largest = np.where(np.arange(len(free)) < len(now.named), MAX_EFFECT, MAX_NUISANCE) * sd
     theta = now.point.theta + share * step[0]
-    theta[free] = np.clip(theta[free], np.maximum(now.problem.lower_bounds(free), -largest), largest)
+    theta[free] = now.problem.bounded(free, theta[free], largest)
     return theta, np.clip(now.point.s + share * step[1], 0, MAX_STIFFNESS)
 
 
@@ -225,11 +230,10 @@ def candidate_steps(now: Fitted, *, likeliest_set: bool = True) -> list[Step]:
     must be. The same holds if a load is smaller than assumed, because all that hold it are softer, but none of them
     alone. Only then all s may change by one factor; elsewhere the best factor would follow the noise.
     """
-    detected = now.problem.prior.bounded(jnp.where(now.summary.probability > 0.5, now.summary.b, 0.0))
-    steps = [_towards(now, np.asarray(detected)), parameter_step(now)]
+    steps = [_towards(now, detected(now.problem, now.summary)), parameter_step(now)]
     if not now.attached.any():
         steps.append(common_factor_step(now))
-    return [*steps, _towards(now, np.asarray(likeliest(now.belief)))] if likeliest_set else steps
+    return [*steps, _towards(now, likeliest_together(now.summary))] if likeliest_set else steps
 
 
 def parameter_step(now: Fitted) -> Step:
@@ -249,20 +253,31 @@ def common_factor_step(now: Fitted) -> Step:
 def _towards(now: Fitted, to: Float[np.ndarray, " n"]) -> Step:
     """Return the step to a given s, with the parameters that fit it best."""
     point, free, sd = now.point, now.free, now.problem.sd(now.named)
-    best = _joint(now.square, point, free, sd).condition(s=to - point.s).mean()
+    best = joint_information(now.square, point, free, sd).condition(s=to - point.s).mean()
     theta = np.zeros(len(point.theta))
     theta[free] = np.clip(best, -MAX_CHANGE * sd, MAX_CHANGE * sd)
     return theta, to - point.s
 
 
-def _summary(problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> PosteriorSummary:
+def detected(problem: Problem, summary: PosteriorSummary) -> Float[np.ndarray, " n"]:
+    """Return the bounded stiffnesses of the particles that are likelier attached than not, and 0 of the others."""
+    return np.asarray(problem.prior.bounded(jnp.where(summary.probability > 0.5, summary.b, 0.0)))
+
+
+def likeliest_together(summary: PosteriorSummary) -> Float[np.ndarray, " n"]:
+    """Return the bounded stiffnesses of the attachments that are likeliest together."""
+    assert isinstance(summary.belief, AttachmentBelief)
+    return np.asarray(likeliest(summary.belief))
+
+
+def posterior(problem: Problem, square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> PosteriorSummary:
     """Return the posterior of the attachments at a point, with the parameters marginalised."""
-    step = _joint(square, point, free, sd).marginal("s")
+    step = joint_information(square, point, free, sd).marginal("s")
     shift = step.precision @ point.s + step.shift
     return quick_summary(problem.prior.add(jnp.asarray(step.precision), jnp.asarray(shift)))
 
 
-def _joint(square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> GaussianInformation:
+def joint_information(square: np.ndarray, point: Point, free: np.ndarray, sd: np.ndarray) -> GaussianInformation:
     """Return the information about steps of s and of the free parameters, with the prior of the parameters."""
     joint = GaussianInformation.from_normal_equations(square, s=len(point.s), theta=len(free))
     return joint.with_independent("theta", sd**-2, -point.theta[free] / sd**2)

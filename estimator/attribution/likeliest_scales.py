@@ -7,13 +7,11 @@ fields' inner products in their eigenvectors, both likelihoods are sums of a few
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
 from .every_frame import residual, weighed
-from .frame_likelihood import FrameLikelihood
 from .gauss_newton import Fitted
 from .noise_scales import NoiseScales, log_prior
 from .normal_equations import tool_sum
@@ -136,11 +134,5 @@ def _misfit(fitted: Fitted, force: float) -> _Misfit:
         values, vectors = np.linalg.eigh(np.sum([np.asarray(weights[k].among) for k in frames], axis=0))
         eigenvalues.append(np.maximum(values, 0))
         along.append((vectors.T @ np.sum([np.asarray(every[k].fields) for k in frames], axis=0)) ** 2)
-    squared = sum(float(every[k].squared) + float(_log_determinant(weights[k])) for k in weights)
+    squared = sum(float(every[k].squared) + float(weights[k].force_log_determinant()) for k in weights)
     return _Misfit(force=force, squared=squared, eigenvalues=np.array(eigenvalues), along=np.array(along))
-
-
-@eqx.filter_jit
-def _log_determinant(likelihood: FrameLikelihood) -> Float[Array, ""]:
-    """Return the part of the log determinant that depends on the variances, as a compiled program."""
-    return likelihood.force_log_determinant()

@@ -119,6 +119,12 @@ class Problem:
             lowest[self.sheet.place(name)] -= np.asarray(declared)
         return lowest[free]
 
+    def bounded(
+        self, free: np.ndarray, values: Float[np.ndarray, " free"], largest: Float[np.ndarray, " free"]
+    ) -> Float[np.ndarray, " free"]:
+        """Return values of parameters, none below its lower bound or of a size above `largest`."""
+        return np.clip(values, np.maximum(self.lower_bounds(free), -largest), largest)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Point:

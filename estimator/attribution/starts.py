@@ -7,15 +7,20 @@ Noise of the states biases them, so they are starts alone. Another is a linear s
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..belief.attachment_belief import AttachmentBelief
-from ..belief.gaussian_information import GaussianInformation
-from ..filters.implicit import likeliest, quick_summary
 from .every_frame import directions, linearised, weighed
-from .gauss_newton import MAX_STIFFNESS, Fitted, moved, start
+from .gauss_newton import (
+    MAX_STIFFNESS,
+    Fitted,
+    detected,
+    joint_information,
+    likeliest_together,
+    moved,
+    posterior,
+    start,
+)
 from .normal_equations import reduced
 from .problem import Point, Problem
 from .scores import Score
@@ -49,29 +54,24 @@ class ObservedStates:
 
     def starts(self, named: np.ndarray) -> list[Point]:
         """Return starts of a fit of the parameters `named`: with the attachments one by one, and the likeliest set."""
-        problem, s, n = self.problem, self.point.s, len(self.point.s)
+        problem, point, n = self.problem, self.point, len(self.point.s)
         free, sd = problem.free(named), problem.sd(named)
         kept = np.concatenate([np.arange(n), n + free, [len(self.square) - 1]])
-        joint = GaussianInformation.from_normal_equations(self.square[np.ix_(kept, kept)], s=n, theta=len(free))
-        joint = joint.with_independent("theta", sd**-2)
-        of_s = joint.marginal("s")
-        precision = np.asarray(of_s.precision)
-        summary = quick_summary(problem.prior.add(jnp.asarray(precision), jnp.asarray(of_s.shift + precision @ s)))
-        assert isinstance(summary.belief, AttachmentBelief)
-        detected = problem.prior.bounded(jnp.where(summary.probability > 0.5, summary.b, 0.0))
+        square = self.square[np.ix_(kept, kept)]
+        joint = joint_information(square, point, free, sd)
         found = []
-        for to in (np.asarray(detected), np.asarray(likeliest(summary.belief))):
+        summary = posterior(problem, square, point, free, sd)
+        for to in (detected(problem, summary), likeliest_together(summary)):
             to = np.clip(to, 0, MAX_STIFFNESS)
-            step = joint.condition(s=to - s).mean()
+            step = np.asarray(joint.condition(s=to - point.s).mean())
             theta = np.zeros(problem.sheet.size)
-            lowest = np.maximum(problem.lower_bounds(free), -MAX_START_SDS * sd)
-            theta[free] = np.clip(step, lowest, MAX_START_SDS * sd)
-            found.append(start(problem, theta, to, self.point.states, self.frames))
+            theta[free] = problem.bounded(free, step, MAX_START_SDS * sd)
+            found.append(start(problem, theta, to, point.states, self.frames))
         return found
 
 
 def stepped(before: Fitted, at: np.ndarray, score: Score) -> Point:
     """Return the point after a linear step of an effect, at the indices `at`, from a fit without it."""
-    problem, limit = before.problem, MAX_START_SDS * before.problem.prior_sd[at]
-    step = np.clip(before.point.theta[at] + score.theta, np.maximum(problem.lower_bounds(at), -limit), limit)
-    return moved(before, at, step)
+    problem = before.problem
+    to = problem.bounded(at, before.point.theta[at] + score.theta, MAX_START_SDS * problem.prior_sd[at])
+    return moved(before, at, to)

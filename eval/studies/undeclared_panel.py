@@ -5,7 +5,7 @@ noise, and neighbours share half of its variance. Effects that would belong to t
 the start begin after the still frames.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -228,6 +228,11 @@ GROUPS = {
 ROWS = {name: row for rows in GROUPS.values() for name, row in rows.items()}
 USUAL_GROUPS = tuple(group for group in GROUPS if group != "layouts")
 """Groups that are run if none are chosen: the layouts have more rows than all others together."""
+
+
+def rows_of(groups: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of all rows of some groups."""
+    return tuple(row for group in groups for row in GROUPS[group])
 
 
 def scene_with(name: str, seed: int) -> Scene:

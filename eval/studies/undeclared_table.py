@@ -21,7 +21,6 @@ from ..runs.compiled_functions import drop_many_compiled
 from .coarse_layouts import rough_bed
 from .study import Study, Table
 from .undeclared_panel import (
-    GROUPS,
     IMAGES,
     INSIDE,
     ON_LAYOUTS,
@@ -30,6 +29,7 @@ from .undeclared_panel import (
     TOGETHER,
     USUAL_GROUPS,
     PanelRow,
+    rows_of,
     scene_with,
 )
 
@@ -57,7 +57,7 @@ class UndeclaredStudy(Study[UndeclaredCell, Discrepancy]):
     """Study of undeclared effects."""
 
     default_seeds: ClassVar[range] = range(5)
-    rows: tuple[str, ...] = tuple(row for group in USUAL_GROUPS for row in GROUPS[group])
+    rows: tuple[str, ...] = rows_of(USUAL_GROUPS)
     """Names of the panel's rows."""
 
     def cells(self, seeds: Iterable[int]) -> tuple[UndeclaredCell, ...]:
@@ -111,11 +111,6 @@ class UndeclaredStudy(Study[UndeclaredCell, Discrepancy]):
         )
 
 
-def _added(found: Discrepancy) -> set[str]:
-    """Return the effects that a run adds."""
-    return {effect["name"] for effect in found["effects"]}
-
-
 def _listed(cell: UndeclaredCell, found: Discrepancy) -> Discrepancy:
     """Return what a run found, without the friction of a rough bed where its row does not list it."""
     row = ROWS[cell.row]
@@ -144,13 +139,11 @@ def _sums(results: Mapping[UndeclaredCell, Discrepancy]) -> list[str]:
         if runs := [(ROWS[cell.row], _listed(cell, found)) for cell, found in results.items() if cell.row in rows]:
             gained = _gained([found for _, found in runs])
             sentences.append(f"{what}: {_right(runs)}; {gained}; {_covered(runs)}.")
-    nothing = {
-        cell: _listed(cell, found)
-        for cell, found in results.items()
-        if not (ROWS[cell.row].effects or cell.row in OUTSIDE)
-    }
+    nothing = [
+        _listed(cell, found) for cell, found in results.items() if not (ROWS[cell.row].effects or cell.row in OUTSIDE)
+    ]
     if nothing:
-        named_runs = sum(bool(_added(found)) for found in nothing.values())
+        named_runs = sum(bool(found["effects"]) for found in nothing)
         sentences.append(f"Nothing undeclared: {named_runs} of {len(nothing)} named.")
     if outside := [found for cell, found in results.items() if cell.row in OUTSIDE]:
         honest = sum(found["verdict"] in UNEXPLAINED for found in outside)
@@ -160,7 +153,7 @@ def _sums(results: Mapping[UndeclaredCell, Discrepancy]) -> list[str]:
 
 def _right(runs: Runs) -> str:
     """Say how often each effect of a row was added, and how often it was among those named."""
-    added = sum(_added(found) >= set(row.effects) for row, found in runs)
+    added = sum({effect["name"] for effect in found["effects"]} >= set(row.effects) for row, found in runs)
     first = sum(found["effects"][:1] != [] and found["effects"][0]["name"] in row.effects for row, found in runs)
     among = sum(set(named(found)) >= set(row.effects) for row, found in runs)
     return f"named first in {first} of {len(runs)}, all added in {added}, all among those named in {among}"

@@ -89,10 +89,10 @@ class _Undeclared(_TableOptions):
     """Number of runs at a time; the number of usable cores if left out."""
 
     def run(self) -> None:
-        from jiggle_mj.eval.studies.undeclared_panel import GROUPS, USUAL_GROUPS
+        from jiggle_mj.eval.studies.undeclared_panel import USUAL_GROUPS, rows_of
         from jiggle_mj.eval.studies.undeclared_table import UndeclaredStudy
 
-        rows = tuple(row for group in self.rows or USUAL_GROUPS for row in GROUPS[group])
+        rows = rows_of(self.rows or USUAL_GROUPS)
         _print_table(UndeclaredStudy(rows=rows), self, self.seeds, self.jobs, parallel=True)
 
 
