@@ -13,7 +13,7 @@ from ..physics.environment import Tether
 from ..physics.equilibrium import Equilibrium, equilibrium
 from .evidence import Evidence
 
-MAX_NEWTON_STEPS = 25
+MAX_NEWTON_STEPS = 50
 """Most Newton steps of an equilibrium."""
 MIN_TRACE = 1e-12
 """Lower bound of the trace of a precision where it divides [1/m^2]: a particle that nothing was seen of."""

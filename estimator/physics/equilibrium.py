@@ -1,6 +1,7 @@
-"""The sheet's equilibrium x*(b, u) = argmin U by projected Newton, differentiated by the implicit function theorem.
+"""The sheet's equilibrium x*(b, u) = argmin U by Newton's method, differentiated by the implicit function theorem.
 
-Each step solves with the positive semi-definite stand-in of the Hessian. It solves in single precision if that is
+Each step solves with the Hessian, or, where the step would not lower the energy, with its positive semi-definite
+stand-in: near a minimum of a wrinkled sheet that alone converges slowly. It solves in single precision if that is
 accurate enough (an inexact Newton method [Dembo, Eisenstat & Steihaug 1982, doi:10.1137/0719025]), and backtracks until
 the energy falls enough (Armijo's rule). Derivatives use the true Hessian at the solution:
 dx/dtheta = -H^-1 d(grad U)/dtheta. A step that cannot lower the energy ends the search, and the result says so.
@@ -19,7 +20,7 @@ from .energy import SheetEnergy
 MAX_LINEAR_RESIDUAL = 0.1
 """Largest residual of the linear system that a single-precision step may have [unbalanced force]."""
 HESSIAN_SHIFT = 1e-9
-"""Multiple of the identity that makes the positive semi-definite Hessian definite [its largest diagonal entry]."""
+"""Multiple of the identity that makes a positive semi-definite Hessian definite [its largest diagonal entry]."""
 ARMIJO_SHARE = 1e-4
 """Share of the linear model's decrease of the energy that a step must reach."""
 ENERGY_ROUNDING = 1e-15
@@ -99,15 +100,21 @@ def _implicit_solve(energy, matrix, rhs):
 
 
 def _minimise(energy, b, start, force_tolerance, max_steps):
-    """Return x, the largest force and the number of steps of projected Newton with backtracking."""
+    """Return x, the largest force and the number of steps of Newton's method with backtracking."""
     layout = energy.layout
 
     def newton(state):
         x, value, gradient, count, _ = state
-        matrix = energy.hessian(x, b, positive=True)
-        shift = HESSIAN_SHIFT * jnp.max(jnp.abs(matrix.diagonal))
-        matrix = add_to_diagonal(layout, matrix, jnp.broadcast_to(shift * jnp.eye(3), (len(x), 3, 3)))
-        step = newton_step(layout, matrix, gradient)
+
+        def solved(positive: bool):
+            matrix = energy.hessian(x, b, positive=positive)
+            shift = HESSIAN_SHIFT * jnp.max(jnp.abs(matrix.diagonal))
+            matrix = add_to_diagonal(layout, matrix, jnp.broadcast_to(shift * jnp.eye(3), (len(x), 3, 3)))
+            return newton_step(layout, matrix, gradient)
+
+        step = solved(positive=False)
+        downhill = jnp.sum(step * gradient) < 0  # False too where the factor is NaN
+        step = jax.lax.cond(downhill, lambda: step, lambda: solved(positive=True))
         slope = jnp.sum(step * gradient)
 
         def too_far(trial):

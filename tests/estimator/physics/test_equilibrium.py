@@ -75,6 +75,19 @@ def test_a_search_cut_short_says_that_it_has_not_converged(lifted):
     assert float(short.force) > FORCE_TOLERANCE
 
 
+@pytest.mark.parametrize("lift", [0.02, 0.04])
+def test_the_last_steps_of_a_wrinkled_sheet_converge_quadratically(lift):
+    """With elements made positive semi-definite one by one the error falls by a constant factor in each step."""
+    mesh = equilateral(24, 18, 4e-3)
+    corner = mesh.rest[np.argmax(mesh.rest[:, 0] + mesh.rest[:, 1])]
+    energy = gripped(surrogate(mesh, DECLARATION), mesh.rest, corner, corner + np.array([-0.01, -0.01, lift]))
+    far = np.linalg.norm(mesh.rest[:, :2] - corner[None, :2], axis=1) > 0.05
+    b, start = jnp.asarray(STIFFNESS * (far & (np.arange(mesh.n) % 5 == 0))), jnp.asarray(mesh.rest)
+    usual, tight = search(energy, b, start), search(energy, b, start, force_tolerance=TIGHT_FORCE)
+    assert bool(usual.converged) and bool(tight.converged)
+    assert int(tight.steps) - int(usual.steps) <= 2
+
+
 def test_a_step_that_single_precision_cannot_solve_is_solved_in_double():
     """A sheet that floats except for 1e-7 N/m per particle, against membrane edges of 30 N/m."""
     energy, b = surrogate(sheet(), Declaration(gravity=(0.0, 0.0, 0.0), bed=False)), jnp.full(sheet().n, 1e-7)
