@@ -43,11 +43,10 @@ def _half_space(rest: Float[Array, "n 3"], load: Float[Array, "n 3"]) -> Float[A
     An incompressible elastic half-space with a force F on its surface moves at a distance r, which is along the unit
     vector e, by (F + e (e . F)) / (4 pi G r) [Boussinesq and Cerruti; Johnson 1985, Contact Mechanics, section 3.6].
     """
-    apart = rest[:, None] - rest[None]
-    square = jnp.sum(apart**2, axis=2)
+    square = sum((r[:, None] - r[None]) ** 2 for r in rest.T)
     nearness = jnp.where(square > 0, 1 / jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-    along = jnp.einsum("nmi,mi->nm", apart, load)
-    return (nearness @ load + jnp.einsum("nm,nmi->ni", nearness**3 * along, apart)) / (4 * np.pi)
+    along = nearness**3 * (rest @ load.T - jnp.sum(rest * load, axis=1)[None])
+    return (nearness @ load + jnp.sum(along, axis=1)[:, None] * rest - along @ rest) / (4 * np.pi)
 
 
 FOUNDATION = (
