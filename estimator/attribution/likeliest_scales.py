@@ -18,10 +18,14 @@ from .normal_equations import tool_sum
 from .problem import AMPLITUDE
 
 STEP = float(np.log(3.0))
-"""First steps of the search in the logarithm of the force variance [nat]."""
+"""Smallest step outwards in the logarithm of the force variance [nat]."""
+MAX_STEP = 3 * STEP
+"""Largest step outwards [nat]."""
+MAX_BRACKET = 1.5 * STEP
+"""Largest distance of the best place from its neighbours with which the search ends [nat]."""
 MAX_EVALUATIONS = 9
 """Largest number of variances that the search tries."""
-NEAR = 0.25
+NEAR = 0.2
 """Distance from a place that was tried within which the search ends [nat]."""
 LOG_RANGE = (-3.0, 14.0)
 """Range of the logarithms of all variances [nat]. Where a sheet was measured in one plane, or the tool is the mean of
@@ -53,7 +57,7 @@ def likeliest_scales(fitted: Fitted, *, near: NoiseScales | None = None) -> Nois
 
     Args:
         fitted: a fit.
-        near: scales that the search begins at; those of the fit if None.
+        near: scales that the search begins at too; those of the fit alone if None.
     """
     amplitudes: dict[float, float] = {}
 
@@ -62,54 +66,72 @@ def likeliest_scales(fitted: Fitted, *, near: NoiseScales | None = None) -> Nois
         amplitudes[log_force], value = _largest(misfit.log_likelihood)
         return value + log_prior(misfit.force)
 
-    log_force = maximum(log_posterior, float(np.log((near or fitted.problem.scales).force)))
-    nearest = min(amplitudes, key=lambda tried: abs(tried - log_force))
+    own = fitted.problem.scales
+    log_force = maximum(log_posterior, float(np.log(own.force)), float(np.log((near or own).force)))
+    tried = sorted(amplitudes)
+    log_fields = np.interp(log_force, tried, np.log([amplitudes[one] for one in tried]))
     squared = tool_sum(fitted.problem, fitted.equations)
     degrees = 3 * len(fitted.equations)
     tool, _ = _largest(lambda variance: -0.5 * (squared / variance + degrees * np.log(variance)))
-    return NoiseScales(force=float(np.exp(log_force)), fields=amplitudes[nearest], tool=tool)
+    return NoiseScales(force=float(np.exp(log_force)), fields=float(np.exp(log_fields)), tool=tool)
 
 
-def maximum(function: Callable[[float], float], begun: float) -> float:
+def maximum(function: Callable[[float], float], *begun: float) -> float:
     """Return where a log likelihood has its maximum over the logarithm of a variance, within its range.
 
-    It falls exponentially below its maximum and linearly above it, as that of Gaussian residuals does. So the search
-    goes to where the function -(a exp(-x) + b x) / 2 through three places has its maximum. Where the variance is so
-    small that the frames' matrices are singular to rounding, the function is no number; there the range ends.
+    From the places that it begins at, the search goes on outwards until the largest value is between two others. A
+    likelihood falls exponentially below its maximum and linearly above it, as that of Gaussian residuals does. So it
+    then goes to where the function -(a exp(-x) + b x) / 2 through these three places has its maximum. Where the
+    variance is so small that the frames' matrices are singular to rounding, the function is no number; there the range
+    ends.
     """
     lowest, highest = LOG_RANGE
-    begun = float(np.clip(begun, lowest + STEP, highest - STEP))
     found: dict[float, float] = {}
-    following = begun + STEP
+    waiting = [float(np.clip(one, *LOG_RANGE)) for one in begun]
+    following = waiting.pop(0)
     for _ in range(MAX_EVALUATIONS):
         value = function(following)
         if np.isfinite(value):
             found[following] = value
         else:
-            lowest = max(lowest, following + NEAR)
-        places = sorted(found)
-        if len(places) < 3:
-            outwards = [x for x in (begun, begun - STEP) if x > lowest and x not in found]
-            following = outwards[0] if outwards else max([lowest, *places]) + STEP
-            if following > highest:
-                break
+            lowest = following + max(NEAR, (min(found, default=following + 2 * STEP) - following) / 2)
+        waiting = [one for one in waiting if not _tried(one, found)]
+        if waiting:
+            following = waiting.pop(0)
             continue
-        following = float(np.clip(_following(places, [found[x] for x in places]), lowest, highest))
-        if min(abs(following - x) for x in places) < NEAR:
-            return float(np.clip(following, places[0], places[-1]))
-    return max(found, key=lambda x: found[x], default=begun)
+        following = _following(found, lowest, highest) if found else lowest
+        if _tried(following, found):
+            break
+    best = max(found, key=lambda x: found[x], default=begun[0])
+    return following if abs(following - best) < NEAR and min(found) < best < max(found) else best
 
 
-def _following(places: list[float], values: list[float]) -> float:
-    """Return the place to try next, of three or more places in order and their values."""
-    best = int(np.argmax(values))
+def _tried(place: float, found: dict[float, float]) -> bool:
+    """Return whether a place near this one was tried."""
+    return any(abs(place - x) < NEAR for x in found)
+
+
+def _following(found: dict[float, float], lowest: float, highest: float) -> float:
+    """Return the place to try next within a range: beyond the best one if it is the first or the last, else between."""
+    places = sorted(found)
+    best = places.index(max(places, key=lambda x: found[x]))
+    if len(places) == 1:
+        return max(places[0] - STEP, lowest) if places[0] > lowest else places[0] + STEP
+    if best == 0 and places[0] > lowest:
+        return max(places[0] - float(np.clip(2 * (places[1] - places[0]), STEP, MAX_STEP)), lowest)
+    if best == len(places) - 1 and places[-1] < highest:
+        return min(places[-1] + float(np.clip(2 * (places[-1] - places[-2]), STEP, MAX_STEP)), highest)
+    if len(places) == 2:
+        return sum(places) / 2
     middle = min(max(best, 1), len(places) - 2)
     around = np.array(places[middle - 1 : middle + 2])
-    columns = np.column_stack([np.diff(np.exp(-around)), np.diff(around)])
-    a, b = np.linalg.solve(columns, -2 * np.diff(values[middle - 1 : middle + 2]))
-    if a > 0 and b > 0:
-        return float(np.log(a / b))
-    return 2 * places[best] - (places[-1] if best == 0 else places[0])
+    columns = np.column_stack([np.diff(np.exp(around[1] - around)), np.diff(around)])
+    a, b = np.linalg.solve(columns, -2 * np.diff([found[x] for x in around]))
+    following = float(np.clip(around[1] + np.log(a / b), lowest, highest)) if a > 0 and b > 0 else places[best]
+    below, above = np.diff(around)
+    if not _tried(following, found) or max(below, above) <= MAX_BRACKET:
+        return following
+    return float(around[1] + STEP if above > below else around[1] - STEP)
 
 
 def _largest(log_likelihood: Callable[[float], float]) -> tuple[float, float]:
