@@ -14,7 +14,7 @@ from .linear import NormalEquations, WeightedResiduals, misfit, normal_equations
 from .normal_equations import less_offset
 from .problem import Point, Problem
 
-N_DIRECTIONS = 32
+N_DIRECTIONS = 16
 """Number of parameters that most fits pad to, so that one compilation serves them."""
 
 

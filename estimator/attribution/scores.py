@@ -23,7 +23,7 @@ from .problem import Point
 
 INITIAL_GUESS_STEPS = 2
 """Gauss-Newton steps of a fit from an initial guess of an effect."""
-MIN_SCORE = 5.0
+MIN_SCORE = 10.0
 """Log Bayes factor of one step from which an effect is fitted [nat]. The prior alone is against each by 4."""
 MAX_START_MISFIT = 4.0
 """Largest misfit at an initial guess with which the fit is tried [misfits without the effect]."""
