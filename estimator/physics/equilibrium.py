@@ -104,23 +104,20 @@ def _minimise(energy, b, start, force_tolerance, max_steps):
     layout = energy.layout
 
     def newton(state):
-        x, value, gradient, count, _ = state
-
-        def solved(positive: bool):
-            matrix = energy.hessian(x, b, positive=positive)
-            shift = HESSIAN_SHIFT * jnp.max(jnp.abs(matrix.diagonal))
-            matrix = add_to_diagonal(layout, matrix, jnp.broadcast_to(shift * jnp.eye(3), (len(x), 3, 3)))
-            return newton_step(layout, matrix, gradient)
-
-        step = solved(positive=False)
-        downhill = jnp.sum(step * gradient) < 0  # False too where the factor is NaN
-        step = jax.lax.cond(downhill, lambda: step, lambda: solved(positive=True))
+        x, value, gradient, count, convex, _ = state
+        matrix = jax.lax.cond(
+            convex, lambda: energy.hessian(x, b, positive=True), lambda: energy.hessian(x, b, positive=False)
+        )
+        shift = HESSIAN_SHIFT * jnp.max(jnp.abs(matrix.diagonal))
+        matrix = add_to_diagonal(layout, matrix, jnp.broadcast_to(shift * jnp.eye(3), (len(x), 3, 3)))
+        step = newton_step(layout, matrix, gradient)
         slope = jnp.sum(step * gradient)
+        uphill = ~convex & ~(slope < 0)  # also where the factor is NaN; the next step has the stand-in
 
         def too_far(trial):
             length, (new, _) = trial
             highest = value + ARMIJO_SHARE * length * slope + ENERGY_ROUNDING * jnp.abs(value)
-            return (~(new <= highest)) & (length > MIN_STEP_LENGTH)
+            return ~uphill & (~(new <= highest)) & (length > MIN_STEP_LENGTH)
 
         def halve(trial):
             length, _ = trial
@@ -128,17 +125,18 @@ def _minimise(energy, b, start, force_tolerance, max_steps):
 
         untried = (2 * jnp.ones(()), (jnp.full_like(value, jnp.inf), gradient))
         length, (new, new_gradient) = jax.lax.while_loop(too_far, halve, untried)
-        stuck = length <= MIN_STEP_LENGTH
+        stuck = ~uphill & (length <= MIN_STEP_LENGTH)
         after = x + length * step, new, new_gradient
-        moved, new, new_gradient = jax.tree.map(partial(jnp.where, stuck), (x, value, gradient), after)
-        return moved, new, new_gradient, count + 1, stuck
+        moved, new, new_gradient = jax.tree.map(partial(jnp.where, stuck | uphill), (x, value, gradient), after)
+        return moved, new, new_gradient, jnp.where(uphill, count, count + 1), uphill, stuck
 
     def unfinished(state):
-        _, _, gradient, count, stuck = state
+        _, _, gradient, count, _, stuck = state
         return (jnp.max(jnp.abs(gradient)) > force_tolerance) & (count < max_steps) & ~stuck
 
-    first = (start, *energy.value_and_gradient(start, b), jnp.zeros((), int), jnp.zeros((), bool))
-    x, _, gradient, count, _ = jax.lax.while_loop(unfinished, newton, first)
+    no = jnp.zeros((), bool)
+    first = (start, *energy.value_and_gradient(start, b), jnp.zeros((), int), no, no)
+    x, _, gradient, count, _, _ = jax.lax.while_loop(unfinished, newton, first)
     return x, jnp.max(jnp.abs(gradient)), count
 
 
