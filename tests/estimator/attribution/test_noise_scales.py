@@ -18,8 +18,8 @@ from jiggle_mj.estimator.attribution.likeliest_scales import (
 from jiggle_mj.estimator.attribution.noise_scales import NoiseScales, log_prior
 from jiggle_mj.estimator.blas import one_thread
 
-CHANGE = 1.5
-"""Factor by which each variance is changed: twice the error of the search, and less than its step."""
+CHANGE = 2.0
+"""Factor by which each variance is changed: more than the error of the search, and less than its step."""
 
 TOLERATED_LOSS = 0.2
 """Of 300 residuals [nat]."""
