@@ -22,7 +22,7 @@ CHANGE = 2.0
 """Factor by which each variance is changed: more than the error of the search, and less than its step."""
 
 TOLERATED_LOSS = 0.2
-"""Of 300 residuals [nat]."""
+"""Loss of log likelihood that is tolerated, of 300 residuals [nat]."""
 
 
 def test_the_prior_of_a_logarithm_has_a_total_of_one():
