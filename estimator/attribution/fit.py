@@ -17,9 +17,9 @@ from .gauss_newton import (
     candidate_steps,
     fit_at,
     gauss_newton,
-    largest_predicted_gain,
     linearise_at,
     linearised_fit,
+    promised_log_posterior,
     weigh,
     weighed_with,
 )
@@ -72,17 +72,17 @@ def fit(
     likeliest = _with_scales(assumed, None if before is None else before.likeliest.problem.scales, worth, log)
     if before is not None:
         begun_there = linearised_fit(before.likeliest, named)
-        if begun_there.log_posterior + largest_predicted_gain(begun_there) / 2 > max(worth, likeliest.log_posterior):
+        if promised_log_posterior(begun_there) > max(worth, likeliest.log_posterior):
             other = _with_scales(gauss_newton(begun_there, log=log), None, worth, log)
             likeliest = max(likeliest, other, key=lambda one: one.log_posterior)
     return Fits(assumed=assumed, likeliest=likeliest)
 
 
 def _with_scales(now: Fitted, near: NoiseScales | None, worth: float, log: Callable[[str], None]) -> Fitted:
-    """Return the fit with errors of the likeliest size, from one with others; `near` is where their search begins."""
+    """Return the fit with errors of the likeliest size, from one with others; their search begins `near` some too."""
     for count in range(MAX_SCALES):
         now, settled = _with_likeliest_scales(now, near if count == 0 else None, log)
-        if settled or not now.log_posterior + largest_predicted_gain(now) / 2 > worth:
+        if settled or not promised_log_posterior(now) > worth:
             break
         now = gauss_newton(now, log=log)
     return now

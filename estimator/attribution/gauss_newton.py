@@ -185,11 +185,8 @@ def better_point(now: Fitted, steps: list[Step]) -> Weighed | None:
     Whole steps are tried first, those of the largest predicted gain, then shorter ones along the first of them. The
     posterior may have stiffnesses that fit worse; a step of the parameters alone then has the larger gain.
     """
-
-    def gain(step: Step, share: float) -> float:
-        return _predicted_gain(now, *_apply(now, step, share))
-
-    whole = sorted((step for step in steps if gain(step, 1.0) > MIN_GAIN), key=lambda step: -gain(step, 1.0))
+    gains = _whole_gains(now, steps)
+    whole = [steps[k] for k in np.argsort(-np.array(gains), kind="stable") if gains[k] > MIN_GAIN]
     shorter = [(step, share) for step in whole[:1] for share in SHORTER_SHARES]
     for step, share in [*((step, 1.0) for step in whole[:MAX_WHOLE]), *shorter]:
         theta, s = _apply(now, step, share)
@@ -200,9 +197,14 @@ def better_point(now: Fitted, steps: list[Step]) -> Weighed | None:
     return None
 
 
-def largest_predicted_gain(now: Fitted) -> float:
-    """Return by how much the cost falls in the best whole step or in none, by the normal equations [nat, doubled]."""
-    return max(0.0, *(_predicted_gain(now, *_apply(now, step, 1.0)) for step in candidate_steps(now)))
+def promised_log_posterior(now: Fitted) -> float:
+    """Return the log posterior that the best whole step, or none, leads to by the normal equations [nat]."""
+    return now.log_posterior + max(0.0, *_whole_gains(now, candidate_steps(now))) / 2
+
+
+def _whole_gains(now: Fitted, steps: list[Step]) -> list[float]:
+    """Return by how much the cost falls in each whole step, by the normal equations [nat, doubled]."""
+    return [_predicted_gain(now, *_apply(now, step, 1.0)) for step in steps]
 
 
 def _apply(now: Fitted, step: Step, share: float) -> Step:

@@ -17,14 +17,15 @@ from scipy.stats import chi2
 from ..belief.gaussian_information import GaussianInformation
 from ..effects.effect import Effect
 from .every_frame import directions, linearised, misfit_under
-from .gauss_newton import Fitted, gauss_newton, largest_predicted_gain, linearise_at, moved
+from .gauss_newton import Fitted, gauss_newton, linearise_at, moved, promised_log_posterior
 from .normal_equations import reduced, without_stiffnesses
 from .problem import Point
 
 INITIAL_GUESS_STEPS = 2
 """Gauss-Newton steps of a fit from an initial guess of an effect."""
 MIN_SCORE = 10.0
-"""Log Bayes factor of one step from which an effect is fitted [nat]. The prior alone is against each by 4."""
+"""Log Bayes factor of one step from which an effect is fitted [nat]. The prior alone is against each by 4, and on two
+coarse layouts no effect of a lower score was named."""
 MAX_START_MISFIT = 4.0
 """Largest misfit at an initial guess with which the fit is tried [misfits without the effect]."""
 SINGULAR = 1e-9
@@ -124,7 +125,7 @@ def _from_initial_guesses(fitted: Fitted, score: Score) -> Score:
     if min(misfits) > MAX_START_MISFIT * fitted.square[-1, -1]:
         return score
     begun = linearise_at(problem, np.append(fitted.named, at), starts[int(np.argmin(misfits))], list(fitted.equations))
-    if not (fitted.cost - begun.cost + largest_predicted_gain(begun)) / 2 > max(MIN_SCORE, score.log_bayes_factor):
+    if not promised_log_posterior(begun) - fitted.log_posterior > max(MIN_SCORE, score.log_bayes_factor):
         return score
     found = gauss_newton(begun, passes=INITIAL_GUESS_STEPS)
     likelier = (fitted.cost - found.cost) / 2
