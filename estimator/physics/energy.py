@@ -42,7 +42,7 @@ class Term(eqx.Module):
     def positive_hessian(self, x: Float[Array, "m p 3"]) -> Float[Array, "m p 3 p 3"]:
         """Return a positive semi-definite stand-in for the Hessian [N/m], with negative eigenvalues set to zero.
 
-        Newton steps use it.
+        Newton steps use it where the Hessian leads uphill.
         """
         m, p, _ = x.shape
         values, vectors = jnp.linalg.eigh(self.hessian(x).reshape(m, 3 * p, 3 * p))
@@ -95,7 +95,7 @@ class SheetEnergy(eqx.Module):
         return self.value(x, b), self.gradient(x, b)
 
     def hessian(self, x: Float[Array, "n 3"], b: Float[Array, " n"], *, positive: bool = False) -> BlockTridiagonal:
-        """Return the Hessian of U [N/m]; with `positive`, the projected one that Newton steps use."""
+        """Return the Hessian of U [N/m]; with `positive`, the sum of the terms' `positive_hessian`."""
         elements = [
             (place, (term.positive_hessian if positive else term.hessian)(x[term.vertices]))
             for term, place in zip(self.terms, self.places, strict=True)
