@@ -25,7 +25,7 @@ MAX_BRACKET = 1.5 * STEP
 """Largest distance of the best place from its neighbours with which the search ends [nat]."""
 MAX_EVALUATIONS = 9
 """Largest number of variances that the search tries."""
-NEAR = 0.2
+NEAR = 0.1
 """Distance from a place that was tried within which the search ends [nat]."""
 LOG_RANGE = (-3.0, 14.0)
 """Range of the logarithms of all variances [nat]. Where a sheet was measured in one plane, or the tool is the mean of

@@ -18,7 +18,7 @@ from jiggle_mj.estimator.attribution.likeliest_scales import (
 from jiggle_mj.estimator.attribution.noise_scales import NoiseScales, log_prior
 from jiggle_mj.estimator.blas import one_thread
 
-CHANGE = 2.0
+CHANGE = 1.3
 """Factor by which each variance is changed: more than the error of the search, and less than its step."""
 
 TOLERATED_LOSS = 0.2
