@@ -18,7 +18,7 @@ from .dataset import Dataset
 from .fit import fit
 from .gauss_newton import MAX_STIFFNESS, Fitted, start
 from .held_out import HeldOut, held_out, predict_held_out
-from .hypotheses import Hypothesis, hypothesis_of, leave_one_out, search
+from .hypotheses import Hypothesis, hypothesis_of, leave_one_out, of_all_frames, search, searched_frames
 from .problem import Point, Problem
 from .remainder import FittedRemainder, remainder_of_fit
 from .scores import parameters_sd
@@ -41,7 +41,8 @@ class Closed:
     final: Hypothesis
     """The declared model with the effects that were added."""
     rivals: list[Hypothesis]
-    """Hypotheses with effects that these frames do not distinguish from the last one; see `EvidenceVerdict.rivals`."""
+    """Hypotheses with effects that these frames do not distinguish from the last one; see `EvidenceVerdict.rivals`. The
+    likeliest is among them if effects of it were taken out again."""
     hypotheses: list[tuple[Hypothesis, float]]
     """All hypotheses that were fitted, with their probabilities, the likeliest first."""
     dropped: dict[str, str]
@@ -83,12 +84,15 @@ def close_the_loop(
     used = set(parts) - {spare}
     if dataset.left_out:
         log(f"{len(dataset.left_out)} frames excluded: the held particles are observed in another shape there")
-    log(f"fitting {len(problem.frames(used))} frames in {len(used)} parts with the declared model")
-    observed, begun = _filter_estimate(problem, dataset, used)
-    fits = fit(problem, np.zeros(0, dtype=int), [begun, *observed.starts(np.zeros(0, dtype=int))], used, log=log)
+    frames = problem.frames(used)
+    few = searched_frames(problem, frames)
+    log(f"fitting {len(few)} of {len(frames)} frames in {len(used)} parts with the declared model")
+    observed, begun = _filter_estimate(problem, dataset, few)
+    fits = fit(problem, np.zeros(0, dtype=int), [begun, *observed.starts(np.zeros(0, dtype=int))], few, log=log)
     check_finite(fits.likeliest)
-    declared = hypothesis_of(fits)
-    found = search(declared, observed, used, log)
+    found = of_all_frames(search(hypothesis_of(fits), observed, log), frames, log)
+    declared = found[0]
+    check_finite(declared.fitted)
     decision = decide([one.evidence for one in found], len(problem.sheet.library))
     path = found[decision.best].path
     predicted = list[HeldOut]()
@@ -107,7 +111,7 @@ def close_the_loop(
         verdict=_verdict(decision, last, dropped),
         declared=declared,
         final=last,
-        rivals=[found[k] for k in decision.rivals if found[k].added] if not dropped else [],
+        rivals=[found[k] for k in ((decision.best,) if dropped else ()) + decision.rivals if found[k].added],
         hypotheses=[(found[k], float(decision.probabilities[k])) for k in np.argsort(-decision.probabilities)],
         dropped=dropped,
         folds=(folds_before, folds_before if last is declared else held_out(after)),
@@ -122,7 +126,7 @@ def close_the_loop(
 def carried_over(
     path: list[Hypothesis], predicted: list[HeldOut]
 ) -> tuple[list[Hypothesis], list[HeldOut], dict[str, str]]:
-    """Return the path up to the last hypothesis that predicts a part no worse than the first, and what is taken out.
+    """Return the path up to the last hypothesis that predicts a part no worse than those before, and what is taken out.
 
     Args:
         path: hypotheses, each with one effect more.
@@ -130,8 +134,9 @@ def carried_over(
     """
     if not predicted:
         return path, predicted, {}
-    last = max(k for k, one in enumerate(predicted) if not one.rms > predicted[0].rms)
-    errors = f"{1e3 * predicted[-1].rms:.2f} mm with it and {1e3 * predicted[0].rms:.2f} mm with what is declared"
+    rms = [one.rms for one in predicted]
+    last = max(k for k, error in enumerate(rms) if not error > min(rms[: k + 1]))
+    errors = f"{1e3 * rms[-1]:.2f} mm with it and {1e3 * rms[last]:.2f} mm without"
     why = f"it did not carry over: the part that chose no effect is predicted to {errors}"
     dropped = {name: why for name in path[-1].names if name not in path[last].names}
     return path[: last + 1], predicted[: last + 1], dropped
@@ -144,9 +149,9 @@ def _verdict(decision: EvidenceVerdict, last: Hypothesis, dropped: dict[str, str
     return "effect-with-remainder" if last.added else "unexplained"
 
 
-def _filter_estimate(problem: Problem, dataset: Dataset, used: set[int]) -> tuple[ObservedStates, Point]:
+def _filter_estimate(problem: Problem, dataset: Dataset, frames: list[int]) -> tuple[ObservedStates, Point]:
     """Return the filter's states, and the equilibria with its stiffnesses."""
-    detection, frames = dataset.detection, problem.frames(used)
+    detection = dataset.detection
     b = jnp.asarray(np.where(detection.attached, detection.stiffness, 0.0))
     s = np.minimum(np.asarray(problem.prior.bounded(b)), MAX_STIFFNESS)
     states = np.array([timed.state for timed in dataset.frames])

@@ -82,7 +82,7 @@ def refused(closed: Closed) -> list[dict[str, str]]:
     """Return the effects that were fitted and are not named, with the reason for each."""
     best, _ = closed.hypotheses[0]
     named = {*closed.final.names, *_beside(closed.rivals, ())}
-    reasons = {name: why for name, why in closed.dropped.items() if name not in named}
+    reasons = dict(closed.dropped)
     for one, probability in closed.hypotheses:
         for name in one.names:
             if name not in named:
@@ -99,6 +99,7 @@ def _probability(one: Hypothesis, probability: float) -> dict[str, Any]:
         "effects": list(one.names),
         "probability": probability,
         "log_evidence": one.log_evidence,
+        "frames": len(one.fitted.equations),
         "variances": {"force": scales.force, "fields": scales.fields, "tool": scales.tool},
         "larger_errors": scales.larger,
     }

@@ -20,6 +20,7 @@ from .gauss_newton import (
     linearise_at,
     linearised_fit,
     promised_log_posterior,
+    start,
     weigh,
     weighed_with,
 )
@@ -46,27 +47,26 @@ def fit(
     problem: Problem,
     named: np.ndarray,
     starts: list[Point],
-    parts: set[int],
+    frames: list[int],
     *,
     before: Fits | None = None,
     worth: float = -np.inf,
     log: Callable[[str], None] = lambda _: None,
 ) -> Fits:
-    """Return the fits of named parameters, nuisance parameters and all stiffnesses to frames of some parts.
+    """Return the fits of named parameters, nuisance parameters and all stiffnesses to some frames.
 
     Args:
         problem: what is fitted to.
         named: parameters of the effects in the model.
         starts: points that the fit may begin at; it begins at the likeliest.
-        parts: parts whose frames are fitted to.
+        frames: frames to fit to.
         before: fits without some of the parameters, which are starts too.
         worth: log posterior [nat]; a fit that cannot reach it, as far as its normal equations tell, ends early.
         log: receives progress messages.
     """
-    frames = problem.frames(parts)
     problem = problem.with_scales(NoiseScales())
+    starts = starts if before is None else [*starts, before.assumed.point]
     begun = [weigh(problem, point, frames) for point in starts]
-    begun += [] if before is None else [before.assumed]
     likelihoods = np.nan_to_num([one.log_likelihood for one in begun], nan=-np.inf)
     assumed = gauss_newton(linearised_fit(begun[int(np.argmax(likelihoods))], named), log=log)
     likeliest = _with_scales(assumed, None if before is None else before.likeliest.problem.scales, worth, log)
@@ -76,6 +76,16 @@ def fit(
             other = _with_scales(gauss_newton(begun_there, log=log), None, worth, log)
             likeliest = max(likeliest, other, key=lambda one: one.log_posterior)
     return Fits(assumed=assumed, likeliest=likeliest)
+
+
+def fit_to_more(fits: Fits, frames: list[int]) -> Fits:
+    """Return fits to more frames, begun where they ended with errors of the likeliest size."""
+    last = fits.likeliest
+    begun = start(last.problem, last.point.theta, last.point.s, last.point.states, frames)
+    likeliest = _with_scales(
+        gauss_newton(linearise_at(last.problem, last.named, begun, frames)), None, -np.inf, lambda _: None
+    )
+    return fits._replace(likeliest=likeliest)
 
 
 def _with_scales(now: Fitted, near: NoiseScales | None, worth: float, log: Callable[[str], None]) -> Fitted:

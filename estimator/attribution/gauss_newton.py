@@ -108,8 +108,8 @@ class Fitted(Weighed):
 
 
 def start(problem: Problem, theta: np.ndarray, s: np.ndarray, states: np.ndarray, frames: list[int]) -> Point:
-    """Return a point with its predictions."""
-    states, seen = predict_all(problem.sheet, theta, s, problem.history, states, only=frames)
+    """Return a point with its predictions of some frames, and of those before them in their grasps."""
+    states, seen = predict_all(problem.sheet, theta, s, problem.history, states, only=problem.up_to(frames))
     return Point(theta=theta, s=s, states=states, seen=seen)
 
 

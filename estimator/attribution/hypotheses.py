@@ -2,19 +2,20 @@
 
 The effects that a fit lacks most, by their scores, are added to it one by one and fitted. The likeliest few of the new
 hypotheses are searched on from, until none is likelier than the best before. At last each effect of the best is left
-out.
+out. All this with a few frames of each part; what is then within reach of the likeliest is fitted to all of them.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..effects import Effect
 from ..parallel_map import parallel_map
 from .evidence import log_model_evidence
-from .fit import Fits, fit, without
+from .fit import Fits, fit, fit_to_more, without
 from .gauss_newton import Fitted, moved
+from .problem import Problem
 from .scores import MIN_SCORE, Score, scores
 from .starts import ObservedStates, stepped
 from .verdict import HypothesisEvidence, log_posterior
@@ -30,8 +31,8 @@ HOPELESS = 200.0
 """Difference of the log posterior of fits from which one is not fitted to its end [nat]: its share is too small."""
 N_FITTED = 4
 """Number of effects that are fitted in addition to a hypothesis, the likeliest by their scores."""
-COMPARED_SHARE = 0.5
-"""Share of the best score from which effects are fitted too that are often confused with the best."""
+N_SEARCHED = 12
+"""Number of frames that the search is over, where there are more: the frames of a pull tell much the same."""
 Log = Callable[[str], None]
 """Receiver of progress messages."""
 
@@ -100,13 +101,21 @@ def hypothesis_of(fits: Fits, added: tuple[AddedEffect, ...] = (), before: Hypot
     return Hypothesis(added=added, fits=fits, log_evidence=log_model_evidence(fits.likeliest), before=before)
 
 
-def search(declared: Hypothesis, observed: ObservedStates, used: set[int], log: Log) -> list[Hypothesis]:
-    """Return all hypotheses that were fitted, the declared model first.
+def searched_frames(problem: Problem, frames: list[int]) -> list[int]:
+    """Return the frames that a search is over: spread over each part of them, with the last one of each."""
+    found = list[int]()
+    for those in problem.by_part(frames).values():
+        count = min(len(those), -(-N_SEARCHED * len(those) // len(frames)))
+        found += [those[(k + 1) * len(those) // count - 1] for k in range(count)]
+    return found
+
+
+def search(declared: Hypothesis, observed: ObservedStates, log: Log) -> list[Hypothesis]:
+    """Return all hypotheses that were fitted to the frames of the declared model's fit, that model first.
 
     Args:
         declared: the fit without effects.
         observed: gives starts of fits.
-        used: parts that are fitted to.
         log: receives progress messages.
     """
     library = len(declared.fitted.problem.sheet.library)
@@ -115,17 +124,24 @@ def search(declared: Hypothesis, observed: ObservedStates, used: set[int], log: 
     def posterior(one: Hypothesis) -> float:
         return log_posterior(one.evidence, library)
 
+    def fitted(one: Hypothesis, score: Score) -> list[Hypothesis]:
+        key = frozenset((*one.names, score.name))
+        if key in found:
+            return []
+        worth = max(other.fitted.log_posterior for other in found.values()) - HOPELESS
+        found[key] = added_to(one, score, observed, worth, log)
+        return [found[key]]
+
     beam = [declared]
     for _ in range(MAX_EFFECTS):
         best = max(map(posterior, found.values()))
         new = list[Hypothesis]()
         for one in (one for one in beam if posterior(one) > best - REACH):
             for score in likely(one, log):
-                key = frozenset((*one.names, score.name))
-                if key not in found:
-                    worth = max(other.fitted.log_posterior for other in found.values()) - HOPELESS
-                    found[key] = added_to(one, score, observed, used, worth, log)
-                    new.append(found[key])
+                new += fitted(one, score)
+        if new and posterior(first := max(new, key=posterior)) > best and first.before is not None:
+            for score in confused(first):
+                new += fitted(first.before, score)
         beam = sorted(new, key=posterior, reverse=True)[:BEAM]
         if not beam or posterior(beam[0]) < best:
             break
@@ -133,51 +149,101 @@ def search(declared: Hypothesis, observed: ObservedStates, used: set[int], log: 
         for one in last.added:
             key = frozenset(last.names) - {one.effect.name}
             if key not in found:
-                found[key] = left_out(last, one, used, log)
+                found[key] = left_out(last, one, log)
         if max(found.values(), key=posterior) is last:
             break
+    if len(last.added) == 1 and (again := left_out(last, last.added[0], log)).log_evidence > declared.log_evidence:
+        return with_declared(list(found.values()), again)
     return list(found.values())
 
 
+def confused(one: Hypothesis) -> list[Score]:
+    """Return the positive scores of the effects that the last one of a hypothesis is often confused with."""
+    assert one.before is not None
+    names = one.added[-1].effect.confounded_with
+    return [score for score in one.before.scores if score.name in names and score.log_bayes_factor > 0]
+
+
+def with_declared(found: list[Hypothesis], again: Hypothesis) -> list[Hypothesis]:
+    """Return hypotheses, the first of which has another fit of the declared model."""
+    now: dict[Hypothesis | None, Hypothesis | None] = {None: None}
+    now[found[0]] = replace(found[0], fits=again.fits, log_evidence=again.log_evidence)
+    result = list[Hypothesis]()
+    for one in sorted(found, key=lambda one: len(one.added)):
+        changed = now.get(one) or replace(one, before=now[one.before])
+        now[one] = changed
+        result.append(changed)
+    return result
+
+
+def of_all_frames(found: list[Hypothesis], frames: list[int], log: Log) -> list[Hypothesis]:
+    """Return hypotheses, the declared model and those within reach of the likeliest fitted to all frames.
+
+    The evidence of the others is extrapolated: their lead over the declared model grows with the number of frames.
+
+    Args:
+        found: hypotheses that were searched for, the declared model first.
+        frames: all frames to fit to.
+        log: receives progress messages.
+    """
+    declared = found[0]
+    library, more = len(declared.fitted.problem.sheet.library), len(frames) / len(declared.fitted.equations)
+    if more == 1:
+        return found
+    fitted: dict[Hypothesis, Hypothesis] = {}
+
+    def of_all(one: Hypothesis) -> Hypothesis:
+        if one not in fitted:
+            before = None if one.before is None else of_all(one.before)
+            result = hypothesis_of(fit_to_more(one.fits, frames), one.added, before)
+            fitted[one] = replace(result, scores=one.scores)
+            _report(fitted[one], log)
+        return fitted[one]
+
+    def estimated(one: Hypothesis) -> Hypothesis:
+        lead = more * (one.log_evidence - declared.log_evidence)
+        return fitted.get(one) or replace(one, log_evidence=of_all(declared).log_evidence + lead)
+
+    while True:
+        now = [estimated(one) for one in found]
+        logs = [log_posterior(one.evidence, library) for one in now]
+        near = [one for one, value in zip(found, logs, strict=True) if value > max(logs) - REACH and one not in fitted]
+        if not near:
+            return now
+        of_all(near[0])
+
+
 def likely(one: Hypothesis, log: Log) -> list[Score]:
-    """Return the scores of the effects to add to a hypothesis: the likeliest, and close ones often confused with it."""
-    found = scores(one.fits.assumed)
+    """Return the scores of the effects to add to a hypothesis, the likeliest first."""
+    found = scores(one.fitted)
     one.scores.extend(found)
     log(f"scores beside {one.title}: " + ", ".join(f"{s.name} {s.log_bayes_factor:.1f}" for s in found[:6]))
-    entering = [score for score in found if score.log_bayes_factor > MIN_SCORE]
-    if not entering:
-        return []
-    confused = one.fitted.problem.sheet.effect(entering[0].name).confounded_with
-    limit = COMPARED_SHARE * entering[0].log_bayes_factor
-    near = [score for score in entering[N_FITTED:] if score.log_bayes_factor > limit]
-    return entering[:N_FITTED] + [score for score in near if score.name in confused]
+    return [score for score in found if score.log_bayes_factor > MIN_SCORE][:N_FITTED]
 
 
-def added_to(
-    before: Hypothesis, score: Score, observed: ObservedStates, used: set[int], worth: float, log: Log
-) -> Hypothesis:
+def added_to(before: Hypothesis, score: Score, observed: ObservedStates, worth: float, log: Log) -> Hypothesis:
     """Return a hypothesis with one more effect, fitted; to its end only if it may reach a log posterior [nat]."""
-    last = before.fits.assumed
+    last = before.fitted
     problem = last.problem
     effect = problem.sheet.effect(score.name)
     one = AddedEffect(effect=effect, score=score, at=problem.sheet.place(effect.name, score.site))
     named = np.append(last.named, one.at).astype(int)
     begun = stepped(last, one.at, score) if score.began is None else score.began
-    fits = fit(problem, named, [begun, *observed.starts(named)], used, before=before.fits, worth=worth)
+    fits = fit(problem, named, [begun, *observed.starts(named)], list(last.equations), before=before.fits, worth=worth)
     result = hypothesis_of(fits, (*before.added, one), before)
     _report(result, log)
     return result
 
 
-def left_out(last: Hypothesis, one: AddedEffect, used: set[int], log: Log) -> Hypothesis:
+def left_out(last: Hypothesis, one: AddedEffect, log: Log) -> Hypothesis:
     """Return a hypothesis without one of its effects, fitted again; to its end only if not hopeless."""
     begun = last.fits.assumed
     named = begun.named[~np.isin(begun.named, one.at)]
     worth = last.fitted.log_posterior - HOPELESS
-    fits = fit(
-        begun.problem, named, [moved(begun, one.at, np.zeros(len(one.at)))], used, before=last.path[0].fits, worth=worth
-    )
-    result = hypothesis_of(fits, tuple(other for other in last.added if other is not one), last.path[0])
+    begin = moved(begun, one.at, np.zeros(len(one.at)))
+    fits = fit(begun.problem, named, [begin], list(begun.equations), before=last.path[0].fits, worth=worth)
+    rest = tuple(other for other in last.added if other is not one)
+    result = hypothesis_of(fits, rest, last.path[0] if rest else None)
     _report(result, log)
     return result
 

@@ -99,6 +99,11 @@ class Problem:
         """Return the frames of some parts."""
         return [k for k, one in enumerate(self.history.frames) if one.part in set(parts)]
 
+    def up_to(self, frames: Iterable[int]) -> list[int]:
+        """Return some frames and those before them in their grasps, on which they may depend."""
+        last = {grasp: max(those) for grasp, those in self.history.by(lambda one: one.grasp, frames).items()}
+        return [k for k, one in enumerate(self.history.frames) if k <= last.get(one.grasp, -1)]
+
     def by_part(self, frames: Iterable[int]) -> dict[int, list[int]]:
         """Return frames grouped by part."""
         return self.history.by(lambda one: one.part, frames)

@@ -255,7 +255,7 @@ MECHANICAL = (
         prior_sd=(0.01, 0.01, 0.01),
         sites=GRID**2,
         source="the weight of one gram",
-        confounded_with=("attachments", "inclusion"),
+        confounded_with=("anchor_shift", "attachments", "inclusion"),
     ),
     Effect(
         name="adhesion",

@@ -23,10 +23,10 @@ SOLVE_RTOL = 1e-5
 def test_a_fit_finds_the_same_size_from_nothing_and_from_the_truth(light):
     closed, _, dataset = light
     problem, before = closed.problem, closed.declared.fitted
-    at, parts = problem.sheet.place("gravity"), {one.part for one in dataset.frames}
+    at, frames = problem.sheet.place("gravity"), list(range(len(dataset.frames)))
     with jax.enable_x64(True), one_thread():
         begun = [moved(before, at, np.array([0.0, 0.0, size])) for size in (0.0, 0.8)]
-        nothing, truth = (fit(problem, at, [point], parts).likeliest for point in begun)
+        nothing, truth = (fit(problem, at, [point], frames).likeliest for point in begun)
     assert nothing.point.theta[at] == pytest.approx(truth.point.theta[at], abs=SIZE_ERROR)
 
 
@@ -140,13 +140,13 @@ def test_a_step_that_fails_as_a_whole_is_shortened(light, monkeypatch):
 
 def test_an_effect_more_does_not_make_a_fit_less_likely(light):
     """It may begin where the fit without it ended. A fit that cannot be worth it does not move under its scales."""
-    closed, _, dataset = light
+    closed = light[0]
     problem, before = closed.problem, closed.final
-    used = {dataset.frames[k].part for k in before.fitted.equations}
+    frames = list(before.fitted.equations)
     named = np.append(before.fitted.named, problem.sheet.place("tool_scale"))
     with jax.enable_x64(True), one_thread():
-        more = fit(problem, named, [before.fits.assumed.point], used, before=before.fits).likeliest
-        hopeless = fit(problem, named, [before.fits.assumed.point], used, before=before.fits, worth=np.inf)
+        more = fit(problem, named, [before.fits.assumed.point], frames, before=before.fits).likeliest
+        hopeless = fit(problem, named, [before.fits.assumed.point], frames, before=before.fits, worth=np.inf)
     assert more.log_posterior >= before.fitted.log_posterior - stepping.MIN_GAIN
     np.testing.assert_array_equal(hopeless.likeliest.point.theta, hopeless.assumed.point.theta)
 
