@@ -3,17 +3,16 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jiggle_mj.estimate import Detection
 
 from .close_loop import Closed
 from .dataset import Dataset
-from .held_out import rms
+from .explain import explanation
 from .hypotheses import Hypothesis
 from .localisation import localisation
+from .reported_part import reported_part
 from .suggestion import Suggestion
-from .trivial_predictions import TRIVIAL, trivial_predictions
 
 
 def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
@@ -44,7 +43,7 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
                 {"before_rms_m": before.rms, "after_rms_m": after.rms}
                 for before, after in zip(*closed.folds, strict=True)
             ],
-            **_reported(closed, dataset),
+            **reported_part(closed, dataset),
         },
         "remainder": {
             "degrees": closed.remainder.degrees,
@@ -59,6 +58,7 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
         "frames": {"used": len(dataset.frames), "left_out": list(dataset.left_out)},
         "localisation": before,
         "localisation_after": before if closed.final is closed.declared else localisation(closed.final.fitted),
+        "explanation": explanation(closed),
         "attachments": {"from": "fit", "why": None},
         "suggestion": None,
         "detection_before": None,
@@ -153,31 +153,3 @@ def suggested(found: Suggestion) -> dict[str, Any]:
         "expected_log_bayes_factor": found.expected,
         "enough": found.enough,
     }
-
-
-def _reported(closed: Closed, dataset: Dataset) -> dict[str, Any]:
-    """Return the figures of the part that chose no effect, and its error in each frame; None without one."""
-    before, after = closed.reported or (None, None)
-    predictions = {"before": before, "after": after, "with_remainder": closed.with_remainder}
-    figures: dict[str, Any] = {}
-    for when, found in predictions.items():
-        figures[f"{when}_rms_m"] = None if found is None else found.rms
-        figures[f"{when}_nll"] = None if found is None else found.nll
-        figures[f"{when}_coverage_90"] = None if found is None else found.coverage_90
-    if closed.reported is None:
-        return figures | dict.fromkeys(f"{name}_rms_m" for name in TRIVIAL) | {"frames": []}
-    of_part = [timed for timed in dataset.frames if timed.part == dataset.frames[-1].part]
-    ends = np.cumsum([int(timed.frame.counted.sum()) for timed in of_part])[:-1]
-    residuals = {when: np.split(found.residual, ends) for when, found in predictions.items() if found is not None}
-    trivial = trivial_predictions(dataset.frames, of_part[0].part)
-    figures |= {f"{name}_rms_m": rms(np.concatenate(trivial[name])) for name in TRIVIAL}
-    residuals |= trivial
-    figures["frames"] = [
-        {"index": timed.index} | {f"{name}_rms_m": _rms(found[k]) for name, found in residuals.items()}
-        for k, timed in enumerate(of_part)
-    ]
-    return figures
-
-
-def _rms(residual: Float[np.ndarray, "m 3"]) -> float | None:
-    return rms(residual) if len(residual) else None

@@ -39,6 +39,8 @@ class NormalEquations(eqx.Module):
 class WeightedResiduals(eqx.Module):
     """A frame's residuals under given weights."""
 
+    forces: Float[Array, "n 3"]
+    """e itself [N]."""
     squared: Float[Array, ""]
     """Squared norm of e under the weights."""
     fields: Float[Array, " q"]
@@ -86,10 +88,11 @@ def misfit(
     """
     model = sheet.model(theta, context, frame.displacement)
     unbalanced = sheet.balance.with_energy(model.energy).unbalanced(x, s)
-    e = (likelihood.forces(frame.y - look(model, x)) + unbalanced)[:, :, None]
+    forces = likelihood.forces(frame.y - look(model, x)) + unbalanced
+    e = forces[:, :, None]
     products = likelihood.dot(jnp.concatenate([likelihood.fields, e], axis=2), e, likelihood.whitened(e))[:, 0]
     tool = tool_residual(sheet, model, theta, frame, context, x) / tool_sd(frame)
-    return WeightedResiduals(squared=products[-1], fields=products[:-1], tool=tool)
+    return WeightedResiduals(forces=forces, squared=products[-1], fields=products[:-1], tool=tool)
 
 
 def parameter_forces(

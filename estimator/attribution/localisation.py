@@ -18,8 +18,9 @@ def localisation(fitted: Fitted) -> dict[str, Any]:
 
     Returns:
         frames: index, grasp, time [s], rms [m]; particles: rest [m] and mean residual, observed minus predicted [m],
-        null where never observed, P(attached) and whether that is more than a half; rank_correlation: Spearman's
-        correlation of the residual's length, over frames and particles, with each regressor.
+        null where never observed, P(attached) and whether that is more than a half, and whether the jaws held it in any
+        of the frames; rank_correlation: Spearman's correlation of the residual's length, over frames and particles,
+        with each regressor.
     """
     problem = fitted.problem
     frames, rest = list(fitted.equations), np.asarray(problem.history.rest)
@@ -47,6 +48,7 @@ def localisation(fitted: Fitted) -> dict[str, Any]:
             "mean_residual_m": [one.tolist() if known else None for one, known in zip(mean, ever, strict=True)],
             "p_attached": fitted.probability.tolist(),
             "attached": fitted.attached.tolist(),
+            "held": np.any([np.asarray(problem.history.frames[k].frame.held) for k in frames], axis=0).tolist(),
         },
         "correlates_with": {
             name: _rank_correlation(distance, values) for name, values in _regressors(problem, fitted, frames).items()

@@ -51,6 +51,14 @@ def less_offset(rows: Float[np.ndarray, "t 3 a"], frame: ClosedFrame) -> Float[n
 
     `frame` is one of them, and gives the standard deviations.
     """
-    ratio = float(grasp_sd(frame) / tool_sd(frame)) ** 2
-    share, together = ratio / (1 + ratio * len(rows)), rows.sum(0)
+    (_, share), together = offset_share(frame, len(rows)), rows.sum(0)
     return np.einsum("tia,tib->ab", rows, rows) - share * np.einsum("ia,ib->ab", together, together)
+
+
+def offset_share(frame: ClosedFrame, count: int) -> tuple[float, float]:
+    """Return the variance of the tool's offset in a grasp, in units of `tool_sd`, and the offset of largest density.
+
+    The latter is over the sum of the residuals of the grasp's `count` frames.
+    """
+    ratio = float(grasp_sd(frame) / tool_sd(frame)) ** 2
+    return ratio, ratio / (1 + ratio * count)

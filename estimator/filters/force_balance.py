@@ -255,7 +255,7 @@ class ForceBalance(eqx.Module):
     def fit(self, frame: Frame) -> Fit:
         """Return the state that explains a frame best, for the s of its linearisation."""
         residual = frame.unbalanced + self.apply(frame.dr_dx, frame.innovation)
-        pushed = self._transposed(frame.dr_dx, frame.weight[:, None] * residual)
+        pushed = self.transposed(frame.dr_dx, frame.weight[:, None] * residual)
         position_residual = self.solved(frame, pushed)
         return Fit(
             residual=residual,
@@ -291,7 +291,7 @@ class ForceBalance(eqx.Module):
 
     def whitened(self, frame: Frame, v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Return N^-1 v."""
-        pushed = self._transposed(frame.dr_dx, frame.weight[:, None] * v)
+        pushed = self.transposed(frame.dr_dx, frame.weight[:, None] * v)
         return frame.weight[:, None] * (v - self.apply(frame.dr_dx, self.solved(frame, pushed)))
 
     def residuals(self, frame: Frame, fit: Fit) -> ForceResiduals:
@@ -369,7 +369,7 @@ class ForceBalance(eqx.Module):
             rows = rows.at[slot.reshape(-1)].add(windows)
         return rows.reshape(n, width, 3, 3)
 
-    def _transposed(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    def transposed(self, rows: Float[Array, "n p 3 3"], v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Return H^T v by indexing: adding into indices takes a CPU five times as long."""
         return self.apply(jnp.swapaxes(rows[self.neighbours, self.back], 2, 3), v)
 
@@ -388,7 +388,7 @@ class ForceBalance(eqx.Module):
         d, free = frame.x - self.energy.rest, (1 - s)[:, None]
         unbalanced = self.reference * d - free * frame.dr_ds
         weighted = self._weight(frame.error, s, evidence)[:, None] * unbalanced
-        push = self.reference * weighted - self._transposed(frame.dD_dx, free * weighted)
+        push = self.reference * weighted - self.transposed(frame.dD_dx, free * weighted)
         if frame.smooth is not None:
             pull = pull + frame.smooth.added_pull(evidence.y - frame.x)
         return self.solved(frame, pull - push)

@@ -1,0 +1,97 @@
+"""Split the log likelihood of a fit exactly over its frames and particles.
+
+With the smooth force fields c and the tool's offset o of each grasp at their likeliest values (see `frame_likelihood`),
+C the covariance of e, t the tool's residual and v the variance of its scale, frame k has
+
+    -1/2 [z^T C^-1 z + ln |C| - 2 ln |H| + |t - o|^2 / v + 3 ln v],   z = e + Q c,
+
+and each grasp, for what its frames share,
+
+    -1/2 [|c|^2 / amplitude^2 + ln |I + amplitude^2 sum_k Q^T C^-1 Q| + |o|^2 / (ratio v)].
+
+z^T C^-1 z is the least of what force errors f, noise d of single positions and noise a of neighbours together cost if
+z = f + H d + H F a:
+
+    z^T C^-1 z = sum_i (w_i |f_i|^2 + d_i^T R_i^-1 d_i) + |a|^2,
+
+with w the precision of force errors and R the covariance of a position's noise. Particle i has its term of that sum,
+which is never negative, and of the determinants an even share if it is observed.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..parallel_map import parallel_map
+from .every_frame import residual
+from .frame_likelihood import N_FIELDS, FrameLikelihood
+from .gauss_newton import Weighed
+from .normal_equations import offset_share
+
+
+@dataclass(frozen=True, kw_only=True)
+class LikelihoodSplit:
+    """Parts of a log likelihood [nat], which sum to it."""
+
+    particles: Float[np.ndarray, "frames n"]
+    """Part of each particle in each frame."""
+    shared: Float[np.ndarray, " frames"]
+    """Part of each frame that belongs to no particle: the tool's reports, and the noise that neighbours share."""
+    grasps: float
+    """What belongs to no frame: the fields and offsets that the frames of a grasp share."""
+
+    @property
+    def frames(self) -> Float[np.ndarray, " frames"]:
+        """Return the part of each frame."""
+        return self.particles.sum(axis=1) + self.shared
+
+
+def likelihood_split(fit: Weighed) -> LikelihoodSplit:
+    """Return the parts of a fit's log likelihood; frames are in the order of its weights."""
+    problem, weights = fit.problem, fit.weights
+    every, variance = residual(problem, weights, fit.point), problem.scales.tool
+    fields, tool, grasps = dict[int, np.ndarray](), dict[int, float](), 0.0
+    for frames in problem.by_part(weights).values():
+        among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
+        along = np.sum([np.asarray(every[k].fields) for k in frames], axis=0)
+        c = -np.linalg.solve(among + np.eye(N_FIELDS) / problem.amplitude**2, along)
+        reports = np.array([np.asarray(every[k].tool) for k in frames])
+        ratio, share = offset_share(problem.history.frames[frames[0]].frame, len(frames))
+        offset = share * reports.sum(axis=0)
+        for k, apart in zip(frames, reports - offset, strict=True):
+            fields[k], tool[k] = c, -0.5 * float(apart @ apart / variance + 3 * np.log(variance))
+        log_det = np.linalg.slogdet(np.eye(N_FIELDS) + problem.amplitude**2 * among)[1]
+        grasps -= 0.5 * float(c @ c / problem.amplitude**2 + log_det + offset @ offset / (ratio * variance))
+
+    def one(k: int) -> tuple[Float[np.ndarray, " n"], float]:
+        seen = np.asarray(weights[k].seen)
+        even = float(weights[k].log_determinant()) * seen / max(seen.sum(), 1.0)
+        squares, smooth = _squares(weights[k], every[k].forces, jnp.asarray(fields[k]))
+        return -0.5 * (np.asarray(squares) + even), tool[k] - 0.5 * float(smooth)
+
+    found = parallel_map(one, weights)
+    return LikelihoodSplit(
+        particles=np.array([found[k][0] for k in weights]),
+        shared=np.array([found[k][1] for k in weights]),
+        grasps=grasps,
+    )
+
+
+@eqx.filter_jit
+def _squares(
+    likelihood: FrameLikelihood, e: Float[Array, "n 3"], c: Float[Array, " q"]
+) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """Return the terms of z^T C^-1 z: of each particle, and |a|^2."""
+    balance, frame = likelihood.balance, likelihood.frame
+    z, white = e + likelihood.fields @ c, likelihood.whitened(e[:, :, None])[:, :, 0] + likelihood.white @ c
+    a = jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nic,ni->c", likelihood.noise, z))
+    weighted = white - likelihood.noise @ a  # w f, and R^-1 d = H^T w f
+    w, pull = frame.weight, balance.transposed(frame.dr_dx, weighted)
+    precision = frame.evidence.white_precision + balance.config.position_precision_floor * jnp.eye(3)[None]
+    of_forces = jnp.where(w > 0, jnp.sum(weighted**2, axis=1) / jnp.where(w > 0, w, 1.0), 0.0)
+    of_positions = jnp.einsum("ni,ni->n", pull, jnp.linalg.solve(precision, pull[:, :, None])[:, :, 0])
+    return of_forces + of_positions, jnp.sum(a**2)
