@@ -16,6 +16,7 @@ from jiggle_mj.estimate import Sheet
 from jiggle_mj.recording.output_files import write_text
 
 from ..metrics.flat_map import plane_of
+from .explanation import explanation_figure, explanation_sentence
 
 SHOWN_HYPOTHESES, LISTED = 10, 3
 """Most hypotheses in the picture of probabilities, whose height holds no more names, and in the sentence."""
@@ -65,6 +66,8 @@ def story(found: Mapping[str, Any]) -> list[str]:
         uses = "" if found["attachments"]["why"] else "; estimate --declare corrected.toml uses it"
         sentences.append(f"The model with it is in corrected.toml{uses}.")
         sentences.append(_attachments_sentence(found))
+    if found["explanation"]:
+        sentences.append(explanation_sentence(found["explanation"][0], found["localisation"]["particles"]))
     sentences += _held_out_sentences(found)
     if found["suggestion"] is not None:
         sentences.append(_suggestion_sentence(found["suggestion"]))
@@ -170,10 +173,21 @@ def write_page(path: Path, *, name: str, sheet: Sheet, found: Mapping[str, Any])
         verdict=found["verdict"],
         sentences=story(found),
         pictures=Markup(pictures),
+        explained=[explanation_sentence(one, found["localisation"]["particles"]) for one in found["explanation"]],
+        explanation=Markup(_explanation(sheet, found)),
         detections=[(when, found[f"detection_{when}"]) for when in TIMES if found[f"detection_{when}"] is not None],
         share=lambda value: "-" if value is None else f"{value:.2f}",
     )
     write_text(path, text)
+
+
+def _explanation(sheet: Sheet, found: Mapping[str, Any]) -> str:
+    """Return the pictures of the explanation as HTML; nothing where no hypothesis is explained."""
+    if not found["explanation"]:
+        return ""
+    flat = plane_of(sheet.rest).flatten(sheet.rest)
+    figure = explanation_figure(found["explanation"], flat, found["localisation"]["particles"])
+    return figure.to_html(full_html=False, include_plotlyjs=False, div_id="explanation")
 
 
 def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
