@@ -16,7 +16,7 @@ from .hypotheses import Hypothesis
 from .likelihood_split import LikelihoodSplit, likelihood_split
 
 N_EXPLAINED = 3
-"""Number of hypotheses that are explained, the likeliest."""
+"""Largest number of hypotheses that are explained, the likeliest that were fitted to all frames."""
 
 
 def explanation(closed: Closed) -> list[dict[str, Any]]:
@@ -28,7 +28,8 @@ def explanation(closed: Closed) -> list[dict[str, Any]]:
         parameters_nat. The sum of particles_nat and shared_nat is that of the frames.
     """
     declared = closed.declared
-    ranked = [one for one, _ in closed.hypotheses if one.added and np.isfinite(one.log_evidence)][:N_EXPLAINED]
+    of_all = [one for one, _ in closed.hypotheses if one.fitted.weights.keys() == declared.fitted.weights.keys()]
+    ranked = [one for one in of_all if one.added and np.isfinite(one.log_evidence)][:N_EXPLAINED]
     splits = parallel_map(lambda k: likelihood_split([declared, *ranked][k].fitted), range(len(ranked) + 1))
     return [_explained(one, declared, splits[k], splits[0]) for k, one in enumerate(ranked, 1)]
 
