@@ -25,6 +25,8 @@ ERRORS = {
 """Keys of `held_out`, each with its words and its colour."""
 PANEL_HEIGHT, ROW_HEIGHT = 160, 18
 """Height of a picture without its rows, and of each recording in it [px]."""
+SHOWN_HYPOTHESES, MIN_PROBABILITY = 4, 0.01
+"""Most hypotheses of a recording that are listed, and the probability from which they are."""
 MISSING = "\N{EN DASH}"
 """Cell without a figure."""
 
@@ -63,6 +65,7 @@ def write_comparison(path: Path, results: Mapping[str, Any]) -> None:
         style=Markup((templates / "report.css").read_text()),
         sentences=summary_sentences(results),
         errors=[words for words, _ in ERRORS.values()],
+        hypotheses={row["name"]: _likeliest(row["posterior"]) for row in done},
         rows=[(row, _error_cells(row)) for row in results["recordings"]],
         effects=results["effects"],
         sizes=[(row["name"], [_size_cell(row["name"], effect) for effect in results["effects"]]) for row in done],
@@ -95,6 +98,12 @@ def _better_trivial(held_out: Mapping[str, Any]) -> str | None:
         return None
     best = min(errors, key=lambda words: errors[words])
     return best if errors[best] < ours else None
+
+
+def _likeliest(posterior: Sequence[Mapping[str, Any]]) -> str:
+    """Return the likeliest hypotheses with their probabilities, in words."""
+    shown = [one for one in posterior[:SHOWN_HYPOTHESES] if one["probability"] >= MIN_PROBABILITY]
+    return ", ".join(f"{' and '.join(one['effects']) or 'nothing'} {one['probability']:.2f}" for one in shown)
 
 
 def _error_cells(row: Mapping[str, Any]) -> list[str]:

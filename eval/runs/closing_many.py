@@ -36,7 +36,7 @@ SUMMARY, PAGE = "results.json", "report.html"
 """Files that compare the recordings."""
 FOREIGN = (RECORDING, ESTIMATE, RESULT, DISCREPANCY, JOB)
 """Files of a single job; a folder with one of them is none for a comparison."""
-FIGURES = ("verdict", "effects", "ambiguous_with", "held_out", "frames", "seconds")
+FIGURES = ("verdict", "effects", "ambiguous_with", "posterior", "held_out", "frames", "seconds")
 """Keys of a recording in results.json that are null where it failed."""
 
 
@@ -229,6 +229,7 @@ def _figures(found: Mapping[str, Any], seconds: float | None) -> dict[str, Any]:
         "verdict": found["verdict"],
         "effects": [effect["name"] for effect in found["effects"]],
         "ambiguous_with": found["ambiguous_with"],
+        "posterior": [{key: one[key] for key in ("effects", "probability")} for one in found["posterior"]],
         "held_out": {name: value for name, value in found["held_out"].items() if not isinstance(value, list)},
         "frames": found["frames"]["used"],
         "seconds": seconds,

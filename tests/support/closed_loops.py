@@ -25,6 +25,10 @@ def discrepancy(*effects: dict, ambiguous_with: list[str] | None = None, error: 
         "verdict": "effect" if effects else "no-effect",
         "effects": list(effects),
         "ambiguous_with": ambiguous_with or [],
+        "posterior": [
+            {"effects": [one["name"] for one in effects], "probability": 0.96, "log_evidence": 7.0},
+            {"effects": ["poisson"], "probability": 0.04, "log_evidence": 0.0},
+        ],
         "held_out": held_out
         | {"with_remainder_coverage_90": None if error is None else 0.9, "folds": [], "frames": []},
         "frames": {"used": 9, "left_out": []},

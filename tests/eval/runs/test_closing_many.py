@@ -66,12 +66,17 @@ def test_each_recording_has_its_folder_and_all_are_compared(recordings, quick, t
     assert [(row["verdict"], row["effects"], row["frames"]) for row in results["recordings"]] == [
         ("effect", ["gravity"], 9), ("effect", ["gravity"], 9), ("no-effect", [], 9)
     ]  # fmt: skip
+    assert [row["posterior"][0] for row in results["recordings"]] == [
+        {"effects": ["gravity"], "probability": 0.96}, {"effects": ["gravity"], "probability": 0.96},
+        {"effects": [], "probability": 0.96}
+    ]  # fmt: skip
     assert all(row["seconds"] > 0 and row["held_out"]["after_rms_m"] == 1e-3 for row in results["recordings"])
     (gravity,) = results["effects"]
     assert gravity["agree"] and gravity["mean"] == pytest.approx([0.75])
     assert lines == ["1 of 3: a: effect, gravity", "2 of 3: b: effect, gravity", "3 of 3: c: no-effect"]
     page = (out / PAGE).read_text()
     assert "gravity is added in 2 of 3; its sizes agree" in page and 'href="a/discrepancy.html"' in page
+    assert "gravity 0.96, poisson 0.04" in page and "nothing 0.96, poisson 0.04" in page
     assert "0.70 ± 0.10" in page and "0.750 ± 0.071" in page
 
 
