@@ -31,6 +31,8 @@ class HypothesisEvidence:
     """Number of combinations of sites that its effects could be at."""
     larger_errors: float
     """Probability that its errors are larger than usual."""
+    log_prior_beside: float = 0.0
+    """Log prior probability of what it has beside these effects, against having nothing beside them [nat]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +57,7 @@ def log_prior(effects: int, sites: int, library: int) -> float:
 
 def log_posterior(one: HypothesisEvidence, library: int) -> float:
     """Return the log posterior probability of a hypothesis [nat], not normalised."""
-    return log_prior(len(one.effects), one.sites, library) + POWER * one.log_evidence
+    return log_prior(len(one.effects), one.sites, library) + one.log_prior_beside + POWER * one.log_evidence
 
 
 def decide(evidences: list[HypothesisEvidence], library: int) -> EvidenceVerdict:
