@@ -79,15 +79,13 @@ def close_the_loop(
     """
     problem = Problem.build(dataset, library)
     check_effects(problem)
-    parts = list(dict.fromkeys(timed.part for timed in dataset.frames))
-    spare = parts[-1] if len(parts) > 1 else None
-    used = set(parts) - {spare}
+    used, spare = dataset.parts
     if dataset.left_out:
         log(f"{len(dataset.left_out)} frames excluded: the held particles are observed in another shape there")
     frames = problem.frames(used)
     few = searched_frames(problem, frames)
     log(f"fitting {len(few)} of {len(frames)} frames in {len(used)} parts with the declared model")
-    observed, begun = _filter_estimate(problem, dataset, few)
+    observed, begun = filter_estimate(problem, dataset, few)
     fits = fit(problem, np.zeros(0, dtype=int), [begun, *observed.starts(np.zeros(0, dtype=int))], few, log=log)
     check_finite(fits.likeliest)
     found = of_all_frames(search(hypothesis_of(fits), observed, log), frames, log)
@@ -149,7 +147,7 @@ def _verdict(decision: EvidenceVerdict, last: Hypothesis, dropped: dict[str, str
     return "effect-with-remainder" if last.added else "unexplained"
 
 
-def _filter_estimate(problem: Problem, dataset: Dataset, frames: list[int]) -> tuple[ObservedStates, Point]:
+def filter_estimate(problem: Problem, dataset: Dataset, frames: list[int]) -> tuple[ObservedStates, Point]:
     """Return the filter's states, and the equilibria with its stiffnesses."""
     detection = dataset.detection
     b = jnp.asarray(np.where(detection.attached, detection.stiffness, 0.0))

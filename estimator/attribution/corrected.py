@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from jiggle_mj.observation import Declaration
 
@@ -29,20 +30,27 @@ class CorrectedParameter:
 
 def corrected_parameters(closed: Closed, declaration: Declaration) -> dict[str, CorrectedParameter]:
     """Return the effects that were added, by the name that a declaration gives them."""
-    found: dict[str, CorrectedParameter] = {}
-    for one in closed.final.added:
-        effect, reach = one.effect, MAX_EFFECT * np.asarray(one.effect.prior_sds[one.score.site])
-        name = effect.name if effect.sites == 1 else f"{effect.name}.{one.score.site}"
-        nominal = np.asarray(declaration.effects.get(name, np.zeros(len(effect.prior_sd))))
-        lowest = nominal - reach
-        found[name] = CorrectedParameter(
-            effect=effect,
-            nominal=tuple(nominal.tolist()),
-            value=tuple((nominal + closed.final.theta(one)).tolist()),
-            min_value=tuple((np.maximum(lowest, 0) if effect.non_negative else lowest).tolist()),
-            max_value=tuple((nominal + reach).tolist()),
-        )
-    return found
+    return dict(
+        corrected_parameter(one.effect, one.score.site, closed.final.theta(one), declaration)
+        for one in closed.final.added
+    )
+
+
+def corrected_parameter(
+    effect: Effect, site: int, theta: Float[np.ndarray, " p"], declaration: Declaration
+) -> tuple[str, CorrectedParameter]:
+    """Return the name that a declaration gives an effect at a site, and its parameters with theta added to them."""
+    reach = MAX_EFFECT * np.asarray(effect.prior_sds[site])
+    name = effect.name if effect.sites == 1 else f"{effect.name}.{site}"
+    nominal = np.asarray(declaration.effects.get(name, np.zeros(len(effect.prior_sd))))
+    lowest = nominal - reach
+    return name, CorrectedParameter(
+        effect=effect,
+        nominal=tuple(nominal.tolist()),
+        value=tuple((nominal + theta).tolist()),
+        min_value=tuple((np.maximum(lowest, 0) if effect.non_negative else lowest).tolist()),
+        max_value=tuple((nominal + reach).tolist()),
+    )
 
 
 def corrected_declaration(parameters: dict[str, CorrectedParameter], declaration: Declaration) -> Declaration:

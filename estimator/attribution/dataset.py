@@ -48,6 +48,13 @@ class Dataset:
     left_out: tuple[int, ...]
     """Indices of excluded frames, in which what is held is observed in another shape than when the jaws closed."""
 
+    @property
+    def parts(self) -> tuple[set[int], int | None]:
+        """Return the parts that effects are chosen by, and the last one, which chooses none; None if it is the only."""
+        parts = list(dict.fromkeys(timed.part for timed in self.frames))
+        spare = parts[-1] if len(parts) > 1 else None
+        return set(parts) - {spare}, spare
+
 
 def collect_dataset(
     declaration: Declaration,

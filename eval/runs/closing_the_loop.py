@@ -22,6 +22,7 @@ from jiggle_mj.estimator.attribution.close_loop import UNEXPLAINED, close_the_lo
 from jiggle_mj.estimator.attribution.corrected import corrected_declaration, corrected_parameters
 from jiggle_mj.estimator.attribution.dataset import collect_dataset
 from jiggle_mj.estimator.attribution.discrepancy import attachments, discrepancy, suggested
+from jiggle_mj.estimator.attribution.kept_fits import KeptLoop
 from jiggle_mj.estimator.attribution.suggestion import suggest
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY, Effect
@@ -39,10 +40,11 @@ from ..report.discrepancy_page import write_page
 from .check_before import check_before
 from .corrected_estimate import corrected_detection
 from .corrected_files import CORRECTED, PARAMETERS, write_corrected
+from .kept_files import FITS, write_fits
 from .settings_used import settings_used, with_declared
 
 DISCREPANCY, PAGE = "discrepancy.json", "discrepancy.html"
-OWN_FILES = (DISCREPANCY, PAGE, CORRECTED, PARAMETERS)
+OWN_FILES = (DISCREPANCY, PAGE, CORRECTED, PARAMETERS, FITS)
 """Files of a closed loop."""
 
 
@@ -54,6 +56,7 @@ def close_loop(
     truth: Path | None = None,
     library: tuple[Effect, ...] = LIBRARY,
     suggestion: bool = False,
+    keep_fits: bool = False,
     config: EstimatorConfig | None = None,
     declare: Mapping[str, Any] | None = None,
     mask: TissueMask | FrameMask | None = None,
@@ -72,6 +75,7 @@ def close_loop(
         truth: a truth file, to score the detected attachments before and after; opened after everything is decided.
         library: effects that are tested; `(*LIBRARY, mine)` adds one.
         suggestion: search the pull that best distinguishes the effects that these frames do not.
+        keep_fits: write what `close_loops` needs to fit several recordings together, too.
         config: of the estimator.
         declare: properties of the tissue by name, over those of the recording; see `Declaration`.
         mask: see `Estimator`.
@@ -100,6 +104,8 @@ def close_loop(
     with jax.enable_x64(True), one_thread():
         closed = close_the_loop(dataset, library=library, log=log)
         found: dict[str, Any] = {**version_entry(), **discrepancy(closed, dataset), "settings": used}
+        if keep_fits:
+            write_fits(directory / FITS, KeptLoop.of(closed))
     sheet, name = dataset.estimator.sheet, recording.metadata.get("name", recording_path.stem)
 
     def write() -> None:

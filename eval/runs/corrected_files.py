@@ -14,6 +14,8 @@ from jiggle_mj.recording.output_files import write_text
 
 CORRECTED, PARAMETERS = "corrected.toml", "parameters.yaml"
 """Names of the two files."""
+CORRECTED_JOINT = "corrected_joint.toml"
+"""Name of the declaration where several recordings share the effects of the tissue."""
 
 
 def write_corrected(
@@ -24,15 +26,20 @@ def write_corrected(
     Raises:
         OutputError: a file cannot be written.
     """
+    write_text(directory / CORRECTED, corrected_text(added, declaration, name=name, file=CORRECTED))
+    write_text(directory / PARAMETERS, parameters_text(added))
+
+
+def corrected_text(added: dict[str, CorrectedParameter], declaration: Declaration, *, name: str, file: str) -> str:
+    """Return the corrected model of the recording `name` as the text of a file of a declaration."""
     corrected = corrected_declaration(added, declaration)
     effects = {effect.name: effect for effect in (*LIBRARY, *(one.effect for one in added.values()))}
-    notes = {key: _note(effects[key.partition(".")[0]]) for key in corrected.effects}
     about = [
-        f"What is declared of {' '.join(name.split())}, with the effects of docs/EFFECTS.md that close-loop has added."
+        f"What is declared of {' '.join(name.split())}, with the effects of docs/EFFECTS.md that close-loop has added.",
+        f"jiggle-mj estimate RECORDING --declare {file} estimates with it.",
     ]
-    about.append(f"jiggle-mj estimate RECORDING --declare {CORRECTED} estimates with it.")
-    write_text(directory / CORRECTED, declaration_text(corrected, about=about, notes=notes))
-    write_text(directory / PARAMETERS, parameters_text(added))
+    notes = {key: _note(effects[key.partition(".")[0]]) for key in corrected.effects}
+    return declaration_text(corrected, about=about, notes=notes)
 
 
 def parameters_text(parameters: dict[str, CorrectedParameter]) -> str:
