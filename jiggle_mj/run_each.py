@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from .cluster import died_with_its_worker
 
@@ -23,6 +23,7 @@ def run_each(
     *,
     on_done: Callable[[Key, str | None], None],
     fails_alone: Callable[[BaseException], bool],
+    on_result: Callable[[Key, Any], None] = lambda key, result: None,
 ) -> dict[Key, str]:
     """Call a function for each argument, and return by key the reasons of the calls that failed.
 
@@ -32,6 +33,7 @@ def run_each(
         executor: calls it; it is not shut down. A call whose worker died is submitted again.
         on_done: called with the key of each call that ended, and the reason if it failed.
         fails_alone: says whether a failure is of its own call; any other ends all.
+        on_result: called with the key of each call that succeeded, and what it returned, before `on_done`.
 
     Raises:
         Exception: the first failure that is not of its call alone. Calls that have not begun are cancelled then, and by
@@ -63,6 +65,7 @@ def run_each(
             key = pending.pop(future)
             failure = CancelledError(CANCELLED) if future.cancelled() else future.exception()
             if failure is None:
+                on_result(key, future.result())
                 on_done(key, None)
             elif isinstance(failure, BrokenExecutor):
                 deaths[key] += 1

@@ -13,6 +13,7 @@ from plotly.subplots import make_subplots
 from jiggle_mj.recording.output_files import write_text
 
 from .discrepancy_page import AFTER, BEFORE, TRIVIAL, WITHOUT_MODEL, sizes_with_sd
+from .joint_section import joint_rows, joint_sentences
 
 ERRORS = {
     "before_rms_m": ("before", BEFORE),
@@ -51,8 +52,13 @@ def summary_sentences(results: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
-def write_comparison(path: Path, results: Mapping[str, Any]) -> None:
+def write_comparison(path: Path, results: Mapping[str, Any], joint: Mapping[str, Any] | None = None) -> None:
     """Write the page; the same input gives the same bytes.
+
+    Args:
+        path: the page.
+        results: content of results.json.
+        joint: content of joint.json, where the recordings were fitted together.
 
     Raises:
         OutputError: the file cannot be written.
@@ -70,6 +76,9 @@ def write_comparison(path: Path, results: Mapping[str, Any]) -> None:
         effects=results["effects"],
         sizes=[(row["name"], [_size_cell(row["name"], effect) for effect in results["effects"]]) for row in done],
         together=[_common_cell(effect) for effect in results["effects"]],
+        joint=joint,
+        joint_sentences=[] if joint is None else joint_sentences(joint),
+        joint_rows=[] if joint is None else joint_rows(joint),
         pictures=Markup(pictures) if done else "",
     )
     write_text(path, text)

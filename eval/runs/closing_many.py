@@ -1,7 +1,7 @@
 """Closes the loop over many recordings of one sheet, several at a time, and compares what was found.
 
 The results of each recording are in a folder of its name, as `close_loop` writes them. What is complete is kept when
-the same job runs again.
+the same job runs again. Effects of the tissue can be fitted to all of them together, see `closing_jointly`.
 """
 
 import json
@@ -30,6 +30,7 @@ from ..metrics.result_file import Json
 from ..report.comparison_page import write_comparison
 from .closing_order import JOB, ClosingOrder
 from .closing_the_loop import DISCREPANCY
+from .joint_result import JOINT, write_jointly
 from .settings_used import with_declared
 
 SUMMARY, PAGE = "results.json", "report.html"
@@ -47,6 +48,7 @@ def close_loops(
     *,
     library: tuple[Effect, ...] = LIBRARY,
     suggestion: bool = False,
+    joint: bool = False,
     config: EstimatorConfig | None = None,
     declare: Mapping[str, Any] | None = None,
     mask: TissueMask | FrameMask | None = None,
@@ -68,6 +70,8 @@ def close_loops(
             must share it, and the recordings, under the same names.
         library: as in `close_loop`, and so the arguments up to `tolerance_ns`.
         suggestion: see `close_loop`.
+        joint: fit effects of the tissue to all recordings together, too; joint.json and a corrected_joint.toml in each
+            folder say what that gives.
         config: of the estimator.
         declare: properties of the tissue, for all recordings.
         mask: the same for all recordings.
@@ -79,10 +83,12 @@ def close_loops(
         log: gets a line for each recording that ends.
 
     Returns:
-        The content of results.json.
+        The content of results.json; with `joint` also that of joint.json under this name, None where fewer than two
+        recordings could be closed.
 
     Raises:
-        OptionError: no recording, two of the same name, or recordings of sheets that are declared differently.
+        OptionError: no recording, two of the same name, or recordings of sheets that are declared differently; with
+            `joint` a single one, or recordings of sheets of different shapes.
         OutputError: the directory holds a recording or other results, or a file cannot be written.
         KeyboardInterrupt: recordings that have not begun are cancelled; complete results stay.
     """
@@ -90,6 +96,10 @@ def close_loops(
     paths = _by_name([Path(path) for path in as_tuple_of(recordings, "recordings", (str, Path))])
     if executor is not None:
         as_instance(executor, "executor", Executor, hint="WorkerProcesses() is one.")
+    if joint and len(paths) < 2:
+        raise OptionError(
+            f"joint: {recordings[0]} is a single recording, and there are no others to fit it with; give two or more."
+        )
     _check_place(directory, paths)
     _refuse_other_sheets(paths, declare, allow_truncated=allow_truncated, tolerance_ns=tolerance_ns)
     options = {
@@ -102,10 +112,10 @@ def close_loops(
         "allow_implausible": allow_implausible,
         "tolerance_ns": tolerance_ns,
     }
-    orders = {name: ClosingOrder.of(path, directory / name, options) for name, path in paths.items()}
+    orders = {name: ClosingOrder.of(path, directory / name, options, keep_fits=joint) for name, path in paths.items()}
     missing = {name: order for name, order in orders.items() if overwrite or not order.is_complete()}
     directory.mkdir(parents=True, exist_ok=True)
-    clear_directory(directory, (SUMMARY, PAGE))
+    clear_directory(directory, (SUMMARY, PAGE, JOINT))
     failed: dict[str, str] = {}
     ended = len(orders) - len(missing)
     if ended:
@@ -119,17 +129,26 @@ def close_loops(
         log(f"{ended} of {len(orders)}: {name}: {_outcome(orders[name].found()) if why is None else f'failed: {why}'}")
 
     with ExitStack() as stack:
+        if executor is None and (missing or joint):
+            executor = stack.enter_context(WorkerProcesses())
         if missing:
+            assert executor is not None
             run_each(
                 ClosingOrder.execute,
                 missing,
-                executor or stack.enter_context(WorkerProcesses()),
+                executor,
                 on_done=on_done,
                 fails_alone=lambda failure: isinstance(failure, Exception),
             )
-    results = _summary(orders, failed)
-    write_text(directory / SUMMARY, json.dumps(results, indent=1) + "\n")
-    write_comparison(directory / PAGE, results)
+        results = _summary(orders, failed)
+        write_text(directory / SUMMARY, json.dumps(results, indent=1) + "\n")
+        write_comparison(directory / PAGE, results)
+        if joint:
+            assert executor is not None
+            closed = {name: order for name, order in orders.items() if name not in failed}
+            together = write_jointly(directory, closed, executor, log) if len(closed) > 1 else None
+            write_comparison(directory / PAGE, results, together)
+            results = results | {"joint": together}
     return results
 
 

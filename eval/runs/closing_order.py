@@ -19,13 +19,18 @@ from jiggle_mj.episode import check_directory, clear_directory
 from jiggle_mj.errors import JiggleError, OutputError
 from jiggle_mj.estimator import EstimatorConfig
 from jiggle_mj.nested_settings import dotted
+from jiggle_mj.observation import Declaration
 from jiggle_mj.recording.declaration import identity, version_entry
 from jiggle_mj.recording.output_files import write_text
+from jiggle_mj.recording.reader import Recording
 
 from ..metrics.result_file import Json, read_json
 from .closing_the_loop import DISCREPANCY, OWN_FILES, close_loop
 from .compiled_functions import drop_many_compiled
+from .corrected_files import CORRECTED_JOINT
+from .kept_files import FITS
 from .mask_files import mask_shown
+from .settings_used import with_declared
 
 JOB, LOG = "job.json", "log.txt"
 """Files in the folder of a recording: what was done, and the lines that a single run prints."""
@@ -46,19 +51,26 @@ class ClosingOrder:
     """What `job.json` holds beside the time: version, digests of the recording and of the settings."""
     options: Mapping[str, Any] = field(repr=False)
     """Arguments of `close_loop` beside recording and folder."""
+    keep_fits: bool = False
+    """Whether the fits are kept, too."""
 
     @classmethod
-    def of(cls, recording: Path, folder: Path, options: Mapping[str, Any]) -> "ClosingOrder":
+    def of(
+        cls, recording: Path, folder: Path, options: Mapping[str, Any], *, keep_fits: bool = False
+    ) -> "ClosingOrder":
         """Return the order for a recording, with digests of what the results depend on.
 
         Args:
             recording: the MCAP file.
             folder: for its results.
             options: all arguments of `close_loop` that change a result.
+            keep_fits: whether the fits are kept, too.
         """
         digests = {"recording": _digest_of_file(recording), "settings": _digest_of(options)}
         job: Json = {**version_entry(), **digests}
-        return cls(recording=recording.absolute(), folder=folder.absolute(), job=job, options=options)
+        return cls(
+            recording=recording.absolute(), folder=folder.absolute(), job=job, options=options, keep_fits=keep_fits
+        )
 
     def is_complete(self) -> bool:
         """Return whether the results exist.
@@ -74,7 +86,21 @@ class ClosingOrder:
         if changed := [name for name, value in self.job.items() if kept.get(name) != value]:
             what = "another recording" if "recording" in changed else "other settings, or of another version"
             raise OutputError(f"{self.folder} holds results of {what}; choose another folder or pass --overwrite.")
-        return kept.get("seconds") is not None and (self.folder / DISCREPANCY).exists()
+        files = (DISCREPANCY, FITS) if self.keep_fits else (DISCREPANCY,)
+        return kept.get("seconds") is not None and all((self.folder / file).exists() for file in files)
+
+    def opened(self) -> tuple[Recording, Declaration]:
+        """Return the recording and what is declared of it.
+
+        Raises:
+            JiggleError: it cannot be read.
+        """
+        recording = Recording.open(
+            self.recording,
+            allow_truncated=self.options["allow_truncated"],
+            tolerance_ns=self.options["tolerance_ns"],
+        )
+        return recording, with_declared(recording.declaration, self.options["declare"])
 
     def found(self) -> dict[str, Any]:
         """Return the content of discrepancy.json."""
@@ -91,7 +117,7 @@ class ClosingOrder:
             JiggleError: what `close_loop` raises.
             RuntimeError: it raised anything else, which another process may not be able to send; the log has all of it.
         """
-        clear_directory(self.folder, (*OWN_FILES, JOB, LOG))
+        clear_directory(self.folder, (*OWN_FILES, CORRECTED_JOINT, JOB, LOG))
         drop_many_compiled()
         self._write_job(seconds=None)
         began = time.perf_counter()
@@ -102,7 +128,14 @@ class ClosingOrder:
 
             try:
                 with mask_shown(self.folder):
-                    close_loop(self.recording, self.folder, **self.options, overwrite=True, log=log)
+                    close_loop(
+                        self.recording,
+                        self.folder,
+                        **self.options,
+                        keep_fits=self.keep_fits,
+                        overwrite=True,
+                        log=log,
+                    )
             except JiggleError as refusal:
                 log(str(refusal))
                 raise

@@ -32,6 +32,7 @@ def close_several(
         JiggleError: what `close_loops` raises.
     """
     from jiggle_mj.eval.report.comparison_page import summary_sentences
+    from jiggle_mj.eval.report.joint_section import joint_sentences
     from jiggle_mj.eval.runs.closing_many import PAGE, close_loops
 
     try:
@@ -42,7 +43,8 @@ def close_several(
             f"interrupted; complete results in {out} stay, and the same command, without --overwrite, continues",
             INTERRUPTED,
         )
-    for sentence in summary_sentences(results):
+    joint = results.get("joint")
+    for sentence in (*summary_sentences(results), *([] if joint is None else joint_sentences(joint))):
         console.print(sentence, highlight=False)
     console.print(f"report: {out / PAGE}")
     if as_json:

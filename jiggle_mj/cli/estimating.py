@@ -201,6 +201,7 @@ def close_loop(
     executor: SchedulerUrl = None,
     truth: Path | None = None,
     suggest: bool = False,
+    joint: bool = False,
     settings: RecordingSettings = AS_RECORDED,
     allow_truncated: bool = False,
     overwrite: bool = False,
@@ -219,6 +220,8 @@ def close_loop(
         executor: Dask scheduler whose workers do it instead; all of them share the recordings and the folder.
         truth: a truth file, to score the detected attachments before and after; it is read after the verdict.
         suggest: where several effects explain the frames, search the next pull that discriminates between them.
+        joint: fit effects of the tissue to all recordings together as well; joint.json and a corrected_joint.toml in
+            each folder say what that gives.
         settings: what is declared of the tissue, how the estimator is set, and which pixels are tissue.
         allow_truncated: use the complete frames of a recording that was cut off.
         overwrite: replace the results in the folder.
@@ -234,7 +237,7 @@ def close_loop(
 
     config, declare = configured(settings.config, settings.set, "implicit"), declared(settings.declare)
     tolerance_ns, given = in_ns(settings.pairing_tolerance), without_truth(recordings)
-    if len(given) != 1 or jobs is not None or executor is not None:
+    if len(given) != 1 or jobs is not None or executor is not None or joint:
         if truth is not None:
             raise OptionError(f"--truth {truth}: it is of one recording; leave it out, or give that recording alone.")
         close_several(
@@ -243,6 +246,7 @@ def close_loop(
             workers(jobs, executor),
             as_json=as_json,
             suggestion=suggest,
+            joint=joint,
             config=config,
             declare=declare,
             mask=_named_mask(settings),

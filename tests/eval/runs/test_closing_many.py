@@ -13,9 +13,10 @@ import pytest
 
 import jiggle_mj as jm
 from jiggle_mj.eval.report.comparison_page import summary_sentences
-from jiggle_mj.eval.runs import closing_order
+from jiggle_mj.eval.runs import closing_many, closing_order
 from jiggle_mj.eval.runs.closing_many import PAGE, SUMMARY, close_loops, without_truth
 from jiggle_mj.eval.runs.closing_order import JOB, LOG
+from jiggle_mj.eval.runs.kept_files import FITS
 from tests.support.closed_loops import QuickLoop, discrepancy, effect
 from tests.support.lifted_recording import N_STILL, PERIOD_NS
 from tests.support.series import Inside
@@ -193,3 +194,35 @@ def test_the_sentences_say_where_a_trivial_prediction_is_better_and_what_belongs
     text = " ".join(summary_sentences({"recordings": [row, row | {"name": "b"}], "effects": [tool]}))
     assert "its sizes differ (p = 0.001)" in text and "it may differ between sessions" in text
     assert "a: that nothing moves predicts the held-out part better than the model does." in text
+
+
+def test_recordings_that_were_closed_are_fitted_together(recordings, quick, tmp_path, monkeypatch):
+    """Those that failed are left out; what they say together is in the page and returned, and not in results.json."""
+    together = {"verdict": "no-effect", "effects": [], "ambiguous_with": [], "recordings": [], "refused": []}
+    together["posterior"] = [{"effects": [], "probability": 1.0, "log_evidence": 3.0, "recordings": {}}]
+    seen = []
+    monkeypatch.setattr(closing_many, "write_jointly", lambda where, orders, *rest: seen.append([*orders]) or together)
+    quick.fails["a"] = jm.PerceptionError("no frame could be used")
+    out = tmp_path / "out"
+    results = closed(recordings, out, joint=True)
+    assert seen == [["b", "c"]] and results["joint"] == together
+    assert "joint" not in json.loads((out / SUMMARY).read_text())
+    assert "All recordings together show no missing effect of the tissue." in (out / PAGE).read_text()
+    quick.fails["b"] = quick.fails["a"]
+    assert closed(recordings, out, joint=True, overwrite=True)["joint"] is None and len(seen) == 1
+
+
+def test_what_was_closed_without_its_fits_is_closed_again_for_all_together(recordings, quick, tmp_path, monkeypatch):
+    monkeypatch.setattr(closing_many, "write_jointly", lambda *arguments: None)
+    out = tmp_path / "out"
+    closed(recordings, out)
+    (out / "b" / FITS).write_bytes(b"kept")
+    closed(recordings, out, joint=True)
+    assert quick.seen == ["a", "b", "c", "a", "c"]
+    assert closed(recordings, out) and quick.seen == ["a", "b", "c", "a", "c"]
+
+
+def test_a_single_recording_is_not_fitted_together_with_others(recordings, quick, tmp_path):
+    with pytest.raises(jm.OptionError, match=r"joint: .*a\.mcap is a single recording.*give two or more"):
+        closed(recordings[:1], tmp_path / "out", joint=True)
+    assert not quick.seen and not (tmp_path / "out").exists()

@@ -6,6 +6,9 @@ from contextlib import nullcontext
 import pytest
 
 from jiggle_mj.eval.runs.closing_many import PAGE, SUMMARY
+from jiggle_mj.eval.runs.corrected_files import CORRECTED_JOINT
+from jiggle_mj.eval.runs.joint_result import JOINT
+from jiggle_mj.recording.declaration_file import read_declaration
 from tests.support.dask_cluster import dask_cluster
 from tests.support.tiny_scene import call, scene_file
 
@@ -31,6 +34,7 @@ def recordings(tmp_path_factory):
         (("a.mcap", "--jobs", 1, "--truth", "a.truth.mcap"), "--truth a.truth.mcap: it is of one recording"),
         (("a.mcap", "b.mcap", "--jobs", 1, "--executor", "dask://x:1"), "give one of them"),
         (("a.mcap", "b.mcap", "--jobs", 0), "jobs"),
+        (("a.mcap", "--joint"), "joint: a.mcap is a single recording"),
         (("a.mcap", "x/a.mcap"), "are both named 'a'"),
     ],
 )
@@ -59,13 +63,23 @@ def test_recordings_that_fail_are_named_and_the_exit_code_says_so(on_cluster, tm
 
 @pytest.mark.slow
 def test_two_recordings_give_what_each_gives_alone_and_one_size(recordings, tmp_path, monkeypatch, capsys):
-    """The truths that the pattern gives are left out, and the tool's scale is found in both, of one size."""
+    """The truths that the pattern gives are left out, and the tool's scale is found in both, of one size.
+
+    Together they share no effect of the tissue, and each keeps its tool's scale.
+    """
     out, alone = tmp_path / "out", tmp_path / "alone"
-    assert call(monkeypatch, "close-loop", *recordings, "--out", out, "--json") == 0
+    assert call(monkeypatch, "close-loop", *recordings, "--joint", "--out", out, "--json") == 0
     printed = capsys.readouterr()
     results = json.loads(printed.out)
     assert [row["name"] for row in results["recordings"]] == ["000000", "000001"]
-    assert {path.name for path in out.iterdir()} == {"000000", "000001", SUMMARY, PAGE}
+    assert {path.name for path in out.iterdir()} == {"000000", "000001", SUMMARY, PAGE, JOINT}
+    joint = json.loads((out / JOINT).read_text())
+    assert results.pop("joint") == joint and joint["posterior"][0]["effects"] == []
+    for one in joint["recordings"]:
+        assert [effect["name"] for effect in one["own_effects"]] == ["tool_scale"]
+        assert one["after_rms_m"] <= one["before_rms_m"]
+        declared = read_declaration(out / one["name"] / CORRECTED_JOINT)
+        assert declared["effects"]["tool_scale"] == pytest.approx(one["own_effects"][0]["theta"])
     (scale,) = [effect for effect in results["effects"] if effect["name"] == "tool_scale"]
     assert len(scale["found"]) == SEEDS and scale["agree"] and "its sizes agree" in printed.err
     assert call(monkeypatch, "close-loop", recordings[0], "--out", alone) == 0
