@@ -21,7 +21,9 @@ def joint_sentences(joint: Mapping[str, Any]) -> list[str]:
     """Return what several recordings say together, in sentences."""
     sentences = [VERDICTS[joint["verdict"]]]
     for effect in joint["effects"]:
-        sentences.append(f"{_name(effect)}, in all recordings: {_sizes(effect)}.")
+        sentences.append(
+            f"{_name(effect)}, in all recordings: {_sizes(effect)}; its probability is {effect['probability']:.2f}."
+        )
     if joint["ambiguous_with"]:
         sentences.append(f"They do not distinguish this from {', '.join(joint['ambiguous_with'])}.")
     for one in joint["recordings"]:

@@ -27,6 +27,7 @@ from jiggle_mj.estimator.attribution.joint_hypotheses import (
 )
 from jiggle_mj.estimator.attribution.kept_fits import KeptFit, KeptLoop
 from jiggle_mj.estimator.attribution.verdict import EvidenceVerdict
+from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.run_each import run_each
 
 from .closing_order import ClosingOrder
@@ -42,8 +43,12 @@ Log = Callable[[str], None]
 class JointlyClosed:
     """What several recordings say together."""
 
+    library: Mapping[str, Effect]
+    """Effects by name."""
     kept: Mapping[str, KeptLoop]
     """The closed loop of each recording by its name."""
+    before: Mapping[str, float | None]
+    """Error of the reported part of each with what is declared [m]; None without such a part."""
     hypotheses: list[JointHypothesis]
     """The sets of shared effects that all recordings were fitted with, the likeliest first."""
     decision: EvidenceVerdict
@@ -97,8 +102,16 @@ def close_jointly(
     taken, of_each, refused = carried_over_jointly(candidates, fixed, before)
     for what, why in refused.items():
         log(f"{what} is not taken: {why}")
+    tested = next(iter(orders.values())).options["library"]
     return JointlyClosed(
-        kept=kept, hypotheses=hypotheses, decision=decision, taken=taken, fixed=of_each, refused=refused
+        library={effect.name: effect for effect in (*LIBRARY, *tested)},
+        kept=kept,
+        before=before,
+        hypotheses=hypotheses,
+        decision=decision,
+        taken=taken,
+        fixed=of_each,
+        refused=refused,
     )
 
 

@@ -11,10 +11,9 @@ from jaxtyping import Float
 
 from jiggle_mj.estimator.attribution.close_loop import jackknife_sd
 from jiggle_mj.estimator.attribution.corrected import CorrectedParameter, corrected_parameter
-from jiggle_mj.estimator.attribution.joint_fits import FixedFit
-from jiggle_mj.estimator.attribution.joint_hypotheses import Effects, JointHypothesis, without_each
+from jiggle_mj.estimator.attribution.joint_hypotheses import Effects, without_each
 from jiggle_mj.estimator.attribution.problem import NUISANCE
-from jiggle_mj.estimator.effects import LIBRARY, Effect
+from jiggle_mj.estimator.effects import Effect
 from jiggle_mj.observation import Declaration
 from jiggle_mj.recording.declaration import version_entry
 from jiggle_mj.recording.output_files import write_text
@@ -27,23 +26,15 @@ JOINT = "joint.json"
 """Name of the file."""
 
 
-def joint_result(
-    closed: JointlyClosed, library: Mapping[str, Effect], before: Mapping[str, float | None]
-) -> dict[str, Any]:
-    """Return the result as numbers, strings and lists; lengths in metres, log Bayes factors in nat.
-
-    Args:
-        closed: the result.
-        library: effects by name.
-        before: error of the reported part of each recording with what is declared [m]; None without such a part.
-    """
-    taken, decision = closed.taken, closed.decision
+def joint_result(closed: JointlyClosed) -> dict[str, Any]:
+    """Return the result as numbers, strings and lists; lengths in metres, log Bayes factors in nat."""
+    taken, decision, library = closed.taken, closed.decision, closed.library
     best = closed.hypotheses[decision.best]
     rivals = [closed.hypotheses[k] for k in decision.rivals] if taken is best else []
     return {
         **version_entry(),
         "verdict": decision.kind if taken is best else "effect-with-remainder" if taken.shared else "unexplained",
-        "effects": _shared_effects(closed, library),
+        "effects": _shared_effects(closed),
         "ambiguous_with": list(dict.fromkeys(name for one in rivals for name in one.names if name not in taken.names)),
         "posterior": [
             {
@@ -61,8 +52,8 @@ def joint_result(
         "recordings": [
             {
                 "name": name,
-                "own_effects": _own_effects(fixed, library),
-                "before_rms_m": before[name],
+                "own_effects": _with_sizes(fixed.own, fixed.theta, own_sd(closed, name), library),
+                "before_rms_m": closed.before[name],
                 "after_rms_m": fixed.rms,
             }
             for name, fixed in closed.fixed.items()
@@ -87,23 +78,19 @@ def write_jointly(
     """
     before = {name: order.found()["held_out"]["before_rms_m"] for name, order in orders.items()}
     closed = close_jointly(orders, before, executor, log)
-    options = next(iter(orders.values())).options
-    library = {effect.name: effect for effect in (*LIBRARY, *options["library"])}
     for name, order in orders.items():
         _, declaration = order.opened()
-        added = _corrected(closed, name, library, declaration)
+        added = _corrected(closed, name, declaration)
         text = corrected_text(added, declaration, name=name, file=CORRECTED_JOINT)
         write_text(order.folder / CORRECTED_JOINT, text)
-    found = joint_result(closed, library, before)
+    found = joint_result(closed)
     write_text(directory / JOINT, json.dumps(found, indent=1) + "\n")
     return found
 
 
-def _corrected(
-    closed: JointlyClosed, recording: str, library: Mapping[str, Effect], declaration: Declaration
-) -> dict[str, CorrectedParameter]:
+def _corrected(closed: JointlyClosed, recording: str, declaration: Declaration) -> dict[str, CorrectedParameter]:
     """Return the shared effects and those of one recording, by the name that a declaration gives them."""
-    fixed = closed.fixed[recording]
+    fixed, library = closed.fixed[recording], closed.library
     effects = (*closed.taken.shared, *fixed.own)
     sizes = _split(effects, np.concatenate([closed.taken.posterior.theta, fixed.theta]), library)
     return dict(
@@ -112,47 +99,52 @@ def _corrected(
     )
 
 
-def shared_sd(one: JointHypothesis, closed: JointlyClosed, library: Mapping[str, Effect]) -> Float[np.ndarray, " d"]:
+def shared_sd(closed: JointlyClosed) -> Float[np.ndarray, " d"]:
     """Return the standard deviations that are reported of the shared parameters.
 
     As in one recording, it is that of one part alone, since the model errs in part alike in all; or the spread between
     the recordings, if that is larger; with the prior of the nuisance parameter of the same name.
     """
+    taken = closed.taken
     parts = sum(kept.n_parts for kept in closed.kept.values())
-    without = [posterior.theta for posterior in without_each(one, closed.prior).values()]
-    spread = np.sqrt(len(without)) * jackknife_sd(without, len(one.posterior.sd))
-    own = [NUISANCE.get(name, (0.0,) * len(library[name].prior_sd)) for name in one.names]
-    return np.hypot(np.maximum(np.sqrt(parts) * one.posterior.sd, spread), np.concatenate([[], *own]))
+    without = [posterior.theta for posterior in without_each(taken, closed.prior).values()]
+    spread = np.sqrt(len(without)) * jackknife_sd(without, len(taken.posterior.sd))
+    return np.hypot(np.maximum(np.sqrt(parts) * taken.posterior.sd, spread), _nuisance_sd(closed, taken.shared))
 
 
-def _shared_effects(closed: JointlyClosed, library: Mapping[str, Effect]) -> list[dict[str, Any]]:
-    taken, sd = closed.taken, shared_sd(closed.taken, closed, library)
+def own_sd(closed: JointlyClosed, recording: str) -> Float[np.ndarray, " k"]:
+    """Return the standard deviations that are reported of the parameters of one recording's own effects."""
+    fixed = closed.fixed[recording]
+    return np.hypot(np.sqrt(closed.kept[recording].n_parts) * fixed.sd, _nuisance_sd(closed, fixed.own))
+
+
+def _nuisance_sd(closed: JointlyClosed, effects: Effects) -> Float[np.ndarray, " k"]:
+    widths = (len(closed.library[name].prior_sd) for name, _ in effects)
+    every = [NUISANCE.get(name, (0.0,) * width) for (name, _), width in zip(effects, widths, strict=True)]
+    return np.concatenate([[], *every])
+
+
+def _shared_effects(closed: JointlyClosed) -> list[dict[str, Any]]:
+    """Return what is known of the shared effects."""
+    taken = closed.taken
+    found = _with_sizes(taken.shared, taken.posterior.theta, shared_sd(closed), closed.library)
     evidences = {one.shared: one.posterior.log_evidence for one in closed.hypotheses}
-    found = [
-        {**named, "theta": theta.tolist(), "sd": spread.tolist(), "units": list(library[named["name"]].units)}
-        for named, theta, spread in zip(
-            _sited(taken.shared, library),
-            _split(taken.shared, taken.posterior.theta, library),
-            _split(taken.shared, sd, library),
-            strict=True,
-        )
-    ]
+    shares = list(zip(closed.hypotheses, closed.decision.probabilities.tolist(), strict=True))
     for one, sited in zip(found, taken.shared, strict=True):
         without = evidences.get(tuple(other for other in taken.shared if other != sited))
         one["log_bayes_factor"] = None if without is None else evidences[taken.shared] - without
+        one["probability"] = sum(share for other, share in shares if sited in other.shared)
     return found
 
 
-def _own_effects(fixed: FixedFit, library: Mapping[str, Effect]) -> list[dict[str, Any]]:
-    sizes = zip(
-        _sited(fixed.own, library),
-        _split(fixed.own, fixed.theta, library),
-        _split(fixed.own, fixed.sd, library),
-        strict=True,
-    )
+def _with_sizes(
+    effects: Effects, theta: Float[np.ndarray, " k"], sd: Float[np.ndarray, " k"], library: Mapping[str, Effect]
+) -> list[dict[str, Any]]:
+    """Return effects with their sizes, standard deviations and units."""
+    sizes = zip(_sited(effects, library), _split(effects, theta, library), _split(effects, sd, library), strict=True)
     return [
-        {**named, "theta": theta.tolist(), "sd": sd.tolist(), "units": list(library[named["name"]].units)}
-        for named, theta, sd in sizes
+        {**named, "theta": size.tolist(), "sd": spread.tolist(), "units": list(library[named["name"]].units)}
+        for named, size, spread in sizes
     ]
 
 

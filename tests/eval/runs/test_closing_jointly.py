@@ -80,7 +80,9 @@ def closed(fits: dict[str, list[KeptFit]], fixed_fits: dict[str, FixedFit] | Non
         name: KeptLoop(rest=sheet().rest, n_parts=3, prior=PRIOR, scores={}, fits=each) for name, each in fits.items()
     }
     return JointlyClosed(
+        library=EFFECTS,
         kept=kept,
+        before={name: 5e-4 if name != "c" else None for name in fits},
         hypotheses=hypotheses,
         decision=decide_jointly(hypotheses, PRIOR),
         taken=hypotheses[0],
@@ -131,18 +133,22 @@ def test_sets_are_fitted_only_where_they_lack_from_the_sizes_that_others_found()
 
 
 def test_the_result_names_what_is_shared_and_what_is_not(creeping):
-    found = joint_result(creeping, EFFECTS, {"a": 5e-4, "b": 6e-4, "c": None})
+    found = joint_result(creeping)
     assert json.loads(json.dumps(found)) == found
     assert found["verdict"] == "effect" and not found["ambiguous_with"]
     (creep,) = found["effects"]
     assert creep["name"] == "tissue_creep" and creep["site"] is None and creep["units"] == ["1/s"]
+    having = [
+        one["probability"] for one in found["posterior"] if {"name": "tissue_creep", "site": None} in one["effects"]
+    ]
+    assert creep["probability"] == pytest.approx(sum(having)) and creep["probability"] > 0.95
     assert creep["theta"][0] == pytest.approx(0.05, rel=1e-3)
     assert sum(one["probability"] for one in found["posterior"]) == pytest.approx(1)
     assert [one["name"] for one in found["recordings"]] == ["a", "b", "c"]
     assert [len(one["own_effects"]) for one in found["recordings"]] == [0, 1, 0]
     text = " ".join(joint_sentences(found))
-    assert "tissue_creep, in all recordings: 0.050 ± 0.017 1/s." in text
-    assert "b alone: tool_scale 0.080 ± 0.010 log factor." in text
+    assert "tissue_creep, in all recordings: 0.050 ± 0.017 1/s; its probability is 1.00." in text
+    assert "b alone: tool_scale 0.080 ± 0.017 log factor." in text  # three parts of sd 0.01
     rows = joint_rows(found)
     assert rows[0][0] == "tissue_creep" and rows[0][4].endswith(" beside tool_scale")
     nothing = next(row for row in rows if row[0] == "nothing")
@@ -152,7 +158,7 @@ def test_the_result_names_what_is_shared_and_what_is_not(creeping):
 def test_the_reported_sd_is_that_of_one_part_or_the_spread_between_recordings():
     """By hand: nine parts of sd 0.01 / sqrt(3); or recordings at 0.01, 0.05 and 0.09, whose deviation is 0.04."""
     alike = closed({name: [kept_fit(), kept_fit(CREEP, nat=9.0)] for name in "abc"})
-    assert shared_sd(alike.taken, alike, EFFECTS)[0] == pytest.approx(3 * SD / 3**0.5, rel=1e-3)
+    assert shared_sd(alike)[0] == pytest.approx(3 * SD / 3**0.5, rel=1e-3)
     apart = closed(
         {
             name: [kept_fit(), kept_fit(CREEP, nat=9.0, theta=theta)]
@@ -160,7 +166,7 @@ def test_the_reported_sd_is_that_of_one_part_or_the_spread_between_recordings():
         }
     )
     assert apart.taken.shared == (CREEP,)
-    assert shared_sd(apart.taken, apart, EFFECTS)[0] == pytest.approx(0.04, rel=1e-2)
+    assert shared_sd(apart)[0] == pytest.approx(0.04, rel=1e-2)
 
 
 def test_what_does_not_carry_over_leaves_something_unexplained(creeping):
@@ -171,7 +177,7 @@ def test_what_does_not_carry_over_leaves_something_unexplained(creeping):
         fixed={name: declared_fit(None) for name in "abc"},
         refused={"tissue_creep": "b is predicted to 0.70 mm with it and 0.60 mm with what is declared"},
     )
-    found = joint_result(refused, EFFECTS, dict.fromkeys("abc"))
+    found = joint_result(refused)
     assert found["verdict"] == "unexplained" and not found["effects"]
     assert "tissue_creep is not taken: b is predicted to 0.70 mm" in " ".join(joint_sentences(found))
 
@@ -203,7 +209,9 @@ def orders(tmp_path) -> dict[str, ClosingOrder]:
     """Two recordings: a was fitted with creep, b was not, though its score speaks for creep."""
     found = {}
     for name, fits in (("a", [kept_fit(), kept_fit(CREEP, nat=4.0)]), ("b", [kept_fit()])):
-        order = ClosingOrder(recording=tmp_path / f"{name}.mcap", folder=tmp_path / name, job={}, options={})
+        order = ClosingOrder(
+            recording=tmp_path / f"{name}.mcap", folder=tmp_path / name, job={}, options={"library": LIBRARY}
+        )
         order.folder.mkdir()
         scores = {CREEP: 9.0} if name == "b" else {}
         write_fits(order.folder / FITS, KeptLoop(rest=sheet().rest, n_parts=3, prior=PRIOR, scores=scores, fits=fits))
