@@ -9,6 +9,7 @@ from jaxtyping import Float
 from ..effects import Effect
 from .close_loop import filter_estimate
 from .dataset import Dataset
+from .evidence import log_model_evidence
 from .fit import fit
 from .gauss_newton import gauss_newton, linearise_at, moved, start
 from .held_out import predict_held_out
@@ -80,9 +81,11 @@ def fit_sets(
                 before=before,
                 worth=before.likeliest.log_posterior - HOPELESS,
             )
-            known[effects] = KeptFit.of(effects, fits)
-            found.append(known[effects])
-            log(f"{title(effects)}: ln Z {known[effects].recorded.information.log_evidence:.1f}")
+            log_evidence = log_model_evidence(fits.likeliest)
+            log(f"{title(effects)}: ln Z {log_evidence:.1f}")
+            if np.isfinite(log_evidence):
+                known[effects] = KeptFit.of(effects, fits, log_evidence)
+                found.append(known[effects])
     return found
 
 

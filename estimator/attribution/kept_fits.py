@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .close_loop import Closed
-from .evidence import log_model_evidence
 from .fit import Fits
 from .gauss_newton import Fitted, linearise_at
 from .joint_evidence import SharedPrior
@@ -60,8 +59,8 @@ class KeptFit:
     """Its evidence, and what it says of shared parameters."""
 
     @classmethod
-    def of(cls, effects: Effects, fits: Fits) -> "KeptFit":
-        """Return the fits of some effects."""
+    def of(cls, effects: Effects, fits: Fits, log_evidence: float) -> "KeptFit":
+        """Return the fits of some effects, of an evidence [nat]."""
         problem, likeliest = fits.likeliest.problem, fits.likeliest
         sensing = {name for name, _ in effects if problem.sheet.effect(name).sensing}
         shared = tuple(sorted(one for one in effects if one[0] not in sensing))
@@ -69,7 +68,7 @@ class KeptFit:
             shared=shared,
             own=tuple(sorted(one for one in effects if one[0] in sensing)),
             larger_errors=problem.scales.larger,
-            information=own_information(likeliest, places(problem, shared), log_model_evidence(likeliest)),
+            information=own_information(likeliest, places(problem, shared), log_evidence),
         )
         ends = {"assumed": KeptPoint.of(fits.assumed), "likeliest": KeptPoint.of(likeliest)}
         return cls(effects=tuple(sorted(effects)), recorded=recorded, **ends)
@@ -97,9 +96,9 @@ class KeptLoop:
 
     @classmethod
     def of(cls, closed: Closed) -> "KeptLoop":
-        """Return what is kept of a closed loop."""
+        """Return what is kept of a closed loop: hypotheses of finite evidence."""
         problem = closed.problem
-        every = [one for one, _ in closed.hypotheses]
+        every = [one for one, _ in closed.hypotheses if not one.added or np.isfinite(one.log_evidence)]
         effects = [tuple((added.effect.name, added.score.site) for added in one.added) for one in every]
         return cls(
             rest=np.asarray(problem.history.rest),
@@ -110,7 +109,7 @@ class KeptLoop:
                 for one in closed.declared.scores
                 if not problem.sheet.effect(one.name).sensing
             },
-            fits=[KeptFit.of(names, one.fits) for names, one in zip(effects, every, strict=True)],
+            fits=[KeptFit.of(names, one.fits, one.log_evidence) for names, one in zip(effects, every, strict=True)],
         )
 
 

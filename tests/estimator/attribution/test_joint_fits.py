@@ -51,6 +51,13 @@ def test_a_file_holds_every_hypothesis_as_it_was(light, kept):
     assert kept.n_parts == len(dataset.parts[0])
 
 
+def test_a_hypothesis_without_finite_evidence_is_not_kept(light):
+    closed, _, _ = light
+    lost = [(dataclasses.replace(one, log_evidence=-np.inf), share) for one, share in closed.hypotheses]
+    with jax.enable_x64(True), one_thread():
+        assert [one.effects for one in KeptLoop.of(dataclasses.replace(closed, hypotheses=lost)).fits] == [()]
+
+
 def test_a_restored_fit_has_the_evidence_that_it_had(light, kept):
     closed, _, dataset = light
     with jax.enable_x64(True), one_thread():
