@@ -90,7 +90,8 @@ class KeptLoop:
     prior: EffectsPrior
     """Prior of the effects that were looked for."""
     scores: Mapping[Sited, float]
-    """Log Bayes factors of one step with each effect of the tissue, at its best site, where nothing is added [nat]."""
+    """Log Bayes factors of one step with each effect of the tissue where nothing is added [nat]: of its best site, if
+    the others have none."""
     fits: list[KeptFit]
     """The hypotheses."""
 
@@ -105,9 +106,9 @@ class KeptLoop:
             n_parts=max(1, len(closed.folds[0])),
             prior=effects_prior(problem),
             scores={
-                (one.name, one.site): one.log_bayes_factor
+                (one.name, one.site): one.log_bayes_factor + float(np.log(effect.sites))
                 for one in closed.declared.scores
-                if not problem.sheet.effect(one.name).sensing
+                if not (effect := problem.sheet.effect(one.name)).sensing
             },
             fits=[KeptFit.of(names, one.fits, one.log_evidence) for names, one in zip(effects, every, strict=True)],
         )

@@ -139,7 +139,7 @@ def carried_over_jointly(
             if not no_worse:
                 assert error is not None
                 least = min(fit.rms for fit in fits if fit.rms is not None)
-                errors = f"{1e3 * least:.2f} mm with it and {1e3 * error:.2f} mm with what is declared"
+                errors = f"{1e3 * least:.4g} mm with it and {1e3 * error:.4g} mm with what is declared"
                 refused[title(one.shared)] = f"{name} is predicted to {errors}"
                 break
             chosen[name] = no_worse[0]

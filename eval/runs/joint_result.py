@@ -42,7 +42,11 @@ def joint_result(closed: JointlyClosed) -> dict[str, Any]:
                 "probability": float(decision.probabilities[k]),
                 "log_evidence": one.posterior.log_evidence,
                 "recordings": {
-                    name: {"log_evidence": fit.information.log_evidence, "own_effects": _sited(fit.own, library)}
+                    name: {
+                        "log_evidence": fit.information.log_evidence,
+                        "theta": fit.information.theta.tolist(),
+                        "own_effects": _sited(fit.own, library),
+                    }
                     for name, fit in one.fits.items()
                 },
             }

@@ -110,7 +110,7 @@ def test_a_set_is_not_taken_where_one_recording_is_predicted_worse(creeping):
     before = {"a": 5e-4, "b": 6e-4, "c": None}
     taken, of_each, refused = carried_over_jointly(candidates, fits, before)
     assert not taken.shared and of_each["b"].own == (SCALE,) and of_each["a"].rms == 5e-4 and not of_each["a"].own
-    assert refused == {"tissue_creep": "b is predicted to 0.70 mm with it and 0.60 mm with what is declared"}
+    assert refused == {"tissue_creep": "b is predicted to 0.7 mm with it and 0.6 mm with what is declared"}
 
 
 def test_a_set_is_taken_where_none_is_predicted_worse_with_or_without_its_own_effects(creeping):
@@ -149,6 +149,7 @@ def test_the_result_names_what_is_shared_and_what_is_not(creeping):
     text = " ".join(joint_sentences(found))
     assert "tissue_creep, in all recordings: 0.050 ± 0.017 1/s; its probability is 1.00." in text
     assert "b alone: tool_scale 0.080 ± 0.017 log factor." in text  # three parts of sd 0.01
+    assert found["posterior"][0]["recordings"]["b"]["theta"] == [0.05]
     rows = joint_rows(found)
     assert rows[0][0] == "tissue_creep" and rows[0][4].endswith(" beside tool_scale")
     nothing = next(row for row in rows if row[0] == "nothing")
@@ -175,11 +176,11 @@ def test_what_does_not_carry_over_leaves_something_unexplained(creeping):
         creeping,
         taken=nothing,
         fixed={name: declared_fit(None) for name in "abc"},
-        refused={"tissue_creep": "b is predicted to 0.70 mm with it and 0.60 mm with what is declared"},
+        refused={"tissue_creep": "b is predicted to 0.7 mm with it and 0.6 mm with what is declared"},
     )
     found = joint_result(refused)
     assert found["verdict"] == "unexplained" and not found["effects"]
-    assert "tissue_creep is not taken: b is predicted to 0.70 mm" in " ".join(joint_sentences(found))
+    assert "tissue_creep is not taken: b is predicted to 0.7 mm" in " ".join(joint_sentences(found))
 
 
 class MadeUp:
