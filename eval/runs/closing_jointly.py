@@ -96,9 +96,12 @@ def close_jointly(
     hypotheses = joint_hypotheses(recorded(fits), prior)
     decision = decide_jointly(hypotheses, prior)
     candidates = [one for one in hypotheses if set(one.shared) <= set(hypotheses[decision.best].shared)]
-    log(f"fitting each recording with the sizes in all of them: {', '.join(title(one.shared) for one in candidates)}")
-    tasks = {name: FixSizes(order=order, fixed=_to_fix(candidates, name, fits[name])) for name, order in orders.items()}
-    fixed = _executed(tasks, executor)
+    to_fix = {name: _to_fix(candidates, name, fits[name]) for name in orders}
+    tasks = {name: FixSizes(order=orders[name], fixed=each) for name, each in to_fix.items() if each}
+    if tasks:
+        sets = ", ".join(title(one.shared) for one in candidates)
+        log(f"fitting {', '.join(tasks)} with sizes that hold for all: {sets}")
+    fixed = {name: list[FixedFit]() for name in orders} | _executed(tasks, executor)
     taken, of_each, refused = carried_over_jointly(candidates, fixed, before)
     for what, why in refused.items():
         log(f"{what} is not taken: {why}")

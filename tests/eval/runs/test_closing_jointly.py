@@ -227,13 +227,18 @@ def test_a_set_is_fitted_where_it_lacks_and_then_decides_for_all(orders, monkeyp
     assert workers.asked == [("b", [(CREEP,)])]
     assert found.taken.shared == (CREEP,) and not found.refused
     assert found.taken.posterior.sd[0] == pytest.approx(SD / 2**0.5, rel=1e-2)
-    assert lines[0] == "fitting tissue_creep to the recordings that lack them: b"
+    assert lines == [
+        "fitting tissue_creep to the recordings that lack them: b",
+        "fitting a, b with sizes that hold for all: tissue_creep, nothing",
+    ]
 
 
 def test_what_one_recording_speaks_against_is_not_shared(orders, monkeypatch):
     workers = MadeUp({"b": {(CREEP,): -6.0}}, {})
     monkeypatch.setattr(closing_jointly, "execute", workers)
-    found = closing_jointly.close_jointly(orders, {"a": 5e-4, "b": 5e-4}, Inside(), lambda _: None)
+    lines = []
+    found = closing_jointly.close_jointly(orders, {"a": 5e-4, "b": 5e-4}, Inside(), lines.append)
+    assert len(lines) == 1  # what is declared is not fitted again
     assert not found.taken.shared and found.decision.kind == "no-effect"
     assert all(one.rms == 5e-4 for one in found.fixed.values())
 
