@@ -130,11 +130,11 @@ def within_reach(
 ) -> list[Effects]:
     """Return the sets that some recording lacks and that may be likely for all, the smallest first.
 
-    In a recording that lacks a set, the missing effects count as if they changed nothing, and one alone as much as its
-    score says.
+    In a recording that lacks a set, the missing effects count as if they changed nothing; or one alone, beside nothing,
+    as much as its score says.
 
     Args:
-        recordings: their fits, one without effects of the tissue among those of each.
+        recordings: their fits, the one without any effect among those of each.
         scores: of each recording, log Bayes factors of one step with an effect of the tissue where nothing is added.
         prior: of the effects.
     """
@@ -148,8 +148,11 @@ def within_reach(
         for name in recordings.keys() - fitted.keys():
             inside = (one for one in recordings[name] if set(one.shared) <= set(shared))
             fitted[name] = max(inside, key=lambda one: one.log_posterior(prior))
-            total += fitted[name].information.log_evidence
-            total += max(0.0, scores[name].get(shared[0], 0.0)) if len(shared) == 1 else 0.0
+            log_evidence = fitted[name].information.log_evidence
+            if len(shared) == 1 and shared[0] in scores[name]:
+                nothing = next(one for one in recordings[name] if not (one.shared or one.own))
+                log_evidence = max(log_evidence, nothing.information.log_evidence + scores[name][shared[0]])
+            total += log_evidence
         beside = sum(one.log_prior_beside(prior) for one in fitted.values())
         if prior.log_prior(shared) + beside + POWER * total > best - REACH:
             wanted.append(shared)

@@ -144,6 +144,16 @@ def test_an_effect_that_no_recording_was_fitted_with_is_in_reach_by_its_scores()
     assert within_reach(recordings, elsewhere, PRIOR) == []
 
 
+def test_a_score_is_not_counted_beside_what_explains_the_same():
+    """In b the tool explains 20 nat, and without it gravity has a score of 20: beside the tool it may have nothing."""
+    recordings = {"a": [fit(), fit("stretch", nat=6.0)], "b": [fit(), fit("tool_scale", nat=20.0)]}
+    recordings["b"].append(fit("stretch", "tool_scale", nat=26.0))
+    scores = {"a": {}, "b": {("gravity", 0): 20.0 / POWER}}
+    assert within_reach(recordings, scores, PRIOR) == []
+    recordings["b"] = [one for one in recordings["b"] if not one.own] + [fit("stretch", nat=6.0)]
+    assert within_reach(recordings, scores, PRIOR) == [(("gravity", 0),)]
+
+
 def test_four_effects_are_not_shared():
     recordings = {"a": [fit(), fit(*TISSUE, nat=50.0)], "b": [fit()]}
     assert within_reach(recordings, {"a": {}, "b": {}}, PRIOR) == []
