@@ -97,9 +97,10 @@ class KeptLoop:
 
     @classmethod
     def of(cls, closed: Closed) -> "KeptLoop":
-        """Return what is kept of a closed loop: hypotheses of finite evidence."""
-        problem = closed.problem
-        every = [one for one, _ in closed.hypotheses if not one.added or np.isfinite(one.log_evidence)]
+        """Return what is kept of a closed loop: hypotheses of finite evidence that were fitted to all frames."""
+        problem, frames = closed.problem, closed.declared.fitted.weights.keys()
+        of_all = [one for one, _ in closed.hypotheses if one.fitted.weights.keys() == frames]
+        every = [one for one in of_all if not one.added or np.isfinite(one.log_evidence)]
         effects = [tuple((added.effect.name, added.score.site) for added in one.added) for one in every]
         return cls(
             rest=np.asarray(problem.history.rest),
