@@ -5,7 +5,7 @@ Fit the declared model, search for hypotheses with more evidence (`hypotheses`),
 becomes a remainder without a name.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from .dataset import Dataset
 from .fit import fit
 from .gauss_newton import MAX_STIFFNESS, Fitted, start
 from .held_out import HeldOut, held_out, predict_held_out
+from .held_out_force import held_out_force_rms
 from .hypotheses import Hypothesis, hypothesis_of, leave_one_out, of_all_frames, search, searched_frames
 from .problem import Point, Problem
 from .remainder import FittedRemainder, remainder_of_fit
@@ -96,7 +97,8 @@ def close_the_loop(
     predicted = list[HeldOut]()
     if spare is not None:
         predicted = [predict_held_out(one.fitted, spare) for one in path]
-    path, predicted, dropped = carried_over(path, predicted)
+    forces = [] if spare is None else [held_out_force_rms(one.fitted, spare) for one in path]
+    path, predicted, dropped = carried_over(path, predicted, forces)
     for name, why in dropped.items():
         log(f"{name} taken out again: {why}")
     last = path[-1]
@@ -122,22 +124,32 @@ def close_the_loop(
 
 
 def carried_over(
-    path: list[Hypothesis], predicted: list[HeldOut]
+    path: list[Hypothesis], predicted: list[HeldOut], forces: Sequence[float | None] = ()
 ) -> tuple[list[Hypothesis], list[HeldOut], dict[str, str]]:
     """Return the path up to the last hypothesis that predicts a part no worse than those before, and what is taken out.
 
     Args:
         path: hypotheses, each with one effect more.
         predicted: prediction of the part by each; empty if there is no such part.
+        forces: error of the tool's force in the part by each [N]. It decides for effects that show in nothing else.
     """
     if not predicted:
         return path, predicted, {}
     rms = [one.rms for one in predicted]
-    last = max(k for k, error in enumerate(rms) if not error > min(rms[: k + 1]))
+    last = max(k for k in range(len(path)) if _carries_over(path, rms, forces, k))
     errors = f"{1e3 * rms[-1]:.2f} mm with it and {1e3 * rms[last]:.2f} mm without"
     why = f"it did not carry over: the part that chose no effect is predicted to {errors}"
     dropped = {name: why for name in path[-1].names if name not in path[last].names}
     return path[: last + 1], predicted[: last + 1], dropped
+
+
+def _carries_over(path: list[Hypothesis], rms: list[float], forces: Sequence[float | None], k: int) -> bool:
+    """Return whether hypothesis k of a path predicts a part no worse than those before."""
+    if path[k].added and path[k].added[-1].effect.needs_force:
+        error, before = forces[k], forces[k - 1]
+        worse = error is not None and before is not None and error > before
+        return not worse and _carries_over(path, rms, forces, k - 1)
+    return not rms[k] > min(rms[: k + 1])
 
 
 def _verdict(decision: EvidenceVerdict, last: Hypothesis, dropped: dict[str, str]) -> str:
@@ -150,7 +162,7 @@ def _verdict(decision: EvidenceVerdict, last: Hypothesis, dropped: dict[str, str
 def filter_estimate(problem: Problem, dataset: Dataset, frames: list[int]) -> tuple[ObservedStates, Point]:
     """Return the filter's states, and the equilibria with its stiffnesses."""
     detection = dataset.detection
-    b = jnp.asarray(np.where(detection.attached, detection.stiffness, 0.0))
+    b = jnp.asarray(np.where(detection.attached, detection.stiffness / dataset.stiffness_factor, 0.0))
     s = np.minimum(np.asarray(problem.prior.bounded(b)), MAX_STIFFNESS)
     states = np.array([timed.state for timed in dataset.frames])
     return (

@@ -15,10 +15,13 @@ from jiggle_mj.observation import Declaration, MeasuredPoints, Observation, Tool
 
 from ..config import EstimatorConfig
 from ..estimator import Estimator
+from ..filters.evidence import MeasuredPull
+from ..force_sensor import ForceSensor
 from ..perception import FrameMask, TissueMask
 from ..perception.still_noise import StillNoise, measure
 from .grasped_frames import ClosedFrame, Timed
 from .held_shape import another_shape
+from .tool_pull import frame_pulls
 
 ASSUMED_SD = 2e-4
 """Standard deviation of the white and of the smooth noise each, where neither still frames nor the recording give it
@@ -27,6 +30,8 @@ ASSUMED_LENGTH = 1.2e-2
 """Range of the smooth noise where there are no still frames [m]."""
 MAX_RESTING_DISPLACEMENT = 1e-3
 """Reported displacement of the tool since the jaws closed up to which the sheet counts as still [m]."""
+OPEN_ALONE = "the force of the tool was measured with open jaws alone, where nothing pulls."
+"""Why forces are not used that no frame with closed jaws has."""
 N_PARTS = 3
 """Parts into which a single grasp is divided; the last one chooses no effect."""
 
@@ -47,6 +52,14 @@ class Dataset:
     """Detection with the declared model alone."""
     left_out: tuple[int, ...]
     """Indices of excluded frames, in which what is held is observed in another shape than when the jaws closed."""
+    force_doubt: str | None = None
+    """Why the measured force of the tool is not used; None where it is, or none was measured."""
+
+    @property
+    def stiffness_factor(self) -> float:
+        """Return the factor by which a measured force makes the filter's stiffnesses larger than the declared one."""
+        check = self.estimator.force_check
+        return 1.0 if check is None or check.stiffness_factor is None else check.stiffness_factor
 
     @property
     def parts(self) -> tuple[set[int], int | None]:
@@ -82,9 +95,11 @@ def collect_dataset(
     estimator, frames, noise = Estimator(declaration, camera, config=config, mask=mask), [], assumed(ASSUMED_SD)
     still: list[MeasuredPoints] = []
     resting: dict[int, list[MeasuredPoints]] = {}
+    pulls, sensor, reported = list[MeasuredPull | None](), ForceSensor(), False
     grasp, closed = -1, 0
     for observation in observations:
-        found = estimator.update(replace(observation, force=None))  # effects are of the declared stiffness
+        found = estimator.update(observation)
+        pull, reported = sensor.look(observation), reported or observation.force is not None
         on_frame(observation, found)
         if observation.points is not None:
             noise = stated(observation.points)
@@ -95,22 +110,31 @@ def collect_dataset(
         if observation.tool.grasp != grasp:
             grasp, closed = observation.tool.grasp, observation.time
         frames.append(_timed(estimator, observation, found, closed=closed))
+        pulls.append(pull)
         if observation.points is not None and np.linalg.norm(frames[-1].frame.displacement) < MAX_RESTING_DISPLACEMENT:
             resting.setdefault(grasp, []).append(observation.points)
     if not frames:
         raise PerceptionError("no frame with closed jaws could be used, so there is nothing to fit effects to.")
     estimator.release()
+    doubt = _doubt(estimator, pulls) if reported else None
+    if doubt is None:
+        frames = [
+            replace(one, frame=replace(one.frame, pull=pull))
+            for one, pull in zip(frames, frame_pulls(pulls), strict=True)
+        ]
     noise = _noise_of([still], estimator) or _noise_of(list(resting.values()), estimator) or noise
     measured = None if estimator.track_ids is None else estimator.track_ids >= 0
     fields, sd = noise.fields(estimator.sheet.rest, measured)
     mistaken = another_shape(frames, sd, fields)
+    stiffness = estimator.declaration.membrane_stiffness
     return Dataset(
         estimator=estimator,
-        frames=_parted([_weighed(one, sd, fields) for one in _without(frames, mistaken)]),
+        frames=_parted([_weighed(one, sd, fields, stiffness) for one in _without(frames, mistaken)]),
         noise=noise,
         fields=fields,
         detection=estimator.detection,
         left_out=tuple(frames[k].index for k in mistaken),
+        force_doubt=doubt,
     )
 
 
@@ -125,6 +149,14 @@ def stated(points: MeasuredPoints) -> StillNoise:
         return assumed(points.sd)
     white = np.sqrt(points.sd**2 - points.smooth_sd**2)
     return StillNoise(sd=float(white), smooth_sd=points.smooth_sd, length=points.smooth_length, frames=0)
+
+
+def _doubt(estimator: Estimator, pulls: list[MeasuredPull | None]) -> str | None:
+    """Return why measured forces of frames with closed jaws are not used; None where they are."""
+    check = estimator.force_check
+    if check is not None:
+        return check.why_not
+    return OPEN_ALONE if all(pull is None for pull in pulls) else None
 
 
 def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, closed: int) -> Timed:
@@ -159,13 +191,22 @@ def _timed(estimator: Estimator, observation: Observation, found: Estimate, *, c
     )
 
 
-def _weighed(one: Timed, sd: float, fields: Float[np.ndarray, "n modes"]) -> Timed:
-    """Return a frame with the precision of its particles, and of the mean of what is held, under the noise."""
+def _weighed(one: Timed, sd: float, fields: Float[np.ndarray, "n modes"], stiffness: float) -> Timed:
+    """Return a frame with the precision of its particles, of the mean of what is held, and of its force, under noise.
+
+    Where the jaws closed on each particle is known up to its noise, which strains the sheet around the grip in all
+    frames of a grasp. So the predicted force has an offset of about that noise times the membrane stiffness [N/m].
+    """
     held = np.asarray(one.frame.held & one.frame.visible)
     shared = np.sum(fields[held].mean(axis=0) ** 2) + sd**2 / held.sum() if held.any() else 0.0
     with jax.enable_x64(True):
         precision = jnp.where(one.frame.visible[:, None, None], jnp.eye(3)[None] / sd**2, 0.0)
-        return replace(one, frame=replace(one.frame, precision=precision, held_sd=jnp.asarray(np.sqrt(shared))))
+        pull = one.frame.pull
+        if pull is not None:
+            pull = replace(pull, offset_sd=jnp.hypot(pull.offset_sd, stiffness * sd))
+        return replace(
+            one, frame=replace(one.frame, precision=precision, held_sd=jnp.asarray(np.sqrt(shared)), pull=pull)
+        )
 
 
 def _without(frames: list[Timed], mistaken: list[int]) -> list[Timed]:

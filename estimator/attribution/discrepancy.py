@@ -9,6 +9,7 @@ from jiggle_mj.estimate import Detection
 from .close_loop import Closed
 from .dataset import Dataset
 from .explain import explanation
+from .force_report import force_report
 from .hypotheses import Hypothesis
 from .localisation import localisation
 from .reported_part import reported_part
@@ -49,6 +50,7 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
             "degrees": closed.remainder.degrees,
             **{f"{name}_sd_m": variance**0.5 for name, variance in closed.remainder.variances.items()},
         },
+        "force": force_report(closed, dataset),
         "noise": {
             "sd_m": noise.sd,
             "smooth_sd_m": noise.smooth_sd,
@@ -100,7 +102,7 @@ def _probability(one: Hypothesis, probability: float) -> dict[str, Any]:
         "probability": probability,
         "log_evidence": one.log_evidence,
         "frames": len(one.fitted.equations),
-        "variances": {"force": scales.force, "fields": scales.fields, "tool": scales.tool},
+        "variances": {"force": scales.force, "fields": scales.fields, "tool": scales.tool, "pull": scales.pull},
         "larger_errors": scales.larger,
     }
 

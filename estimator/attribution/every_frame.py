@@ -13,6 +13,7 @@ from .grasped_frames import ClosedFrame
 from .linear import NormalEquations, WeightedResiduals, misfit, normal_equations
 from .normal_equations import less_offset
 from .problem import Point, Problem
+from .tool_pull import pull_products
 
 N_DIRECTIONS = 16
 """Number of parameters that most fits pad to, so that one compilation serves them."""
@@ -55,6 +56,8 @@ def misfit_under(problem: Problem, weights: dict[int, FrameLikelihood], point: P
 def log_determinants(problem: Problem, weights: dict[int, FrameLikelihood]) -> float:
     """Return the log determinant of all observations' covariance, the smooth fields and the tool included [nat]."""
     total = 3 * len(weights) * float(np.log(problem.scales.tool))
+    if problem.scales.pull is not None:
+        total += 3 * problem.with_force(weights) * float(np.log(problem.scales.pull))
     for frames in problem.by_part(weights).values():
         among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
         with np.errstate(invalid="ignore"):  # where a point has no finite weights, the caller refuses it
@@ -82,6 +85,10 @@ def misfit_of(problem: Problem, weights: dict[int, FrameLikelihood], every: dict
         among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
         total += sum(float(every[k].squared) for k in frames)
         total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0] / problem.scales.tool
+        if problem.scales.pull is not None and problem.with_force(frames):
+            pulls = np.array([np.asarray(every[k].pull)[:, None] for k in frames])
+            closed = [problem.history.frames[k].frame for k in frames]
+            total += pull_products(pulls, closed)[0, 0] / problem.scales.pull
         total -= fields @ np.linalg.solve(among + np.eye(N_FIELDS) / problem.amplitude**2, fields)
     return float(total)
 

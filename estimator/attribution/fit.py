@@ -64,7 +64,7 @@ def fit(
         worth: log posterior [nat]; a fit that cannot reach it, as far as its normal equations tell, ends early.
         log: receives progress messages.
     """
-    problem = problem.with_scales(NoiseScales())
+    problem = problem.with_scales(problem.assumed_scales)
     starts = starts if before is None else [*starts, before.assumed.point]
     begun = [weigh(problem, point, frames) for point in starts]
     likelihoods = np.nan_to_num([one.log_likelihood for one in begun], nan=-np.inf)

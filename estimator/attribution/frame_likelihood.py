@@ -14,6 +14,7 @@ up to a constant. A model that yields more has a wider density, so a comparison 
 eliminated grasp by grasp (`every_frame.cost`).
 """
 
+from dataclasses import replace
 from functools import partial
 
 import equinox as eqx
@@ -31,6 +32,7 @@ from ..physics.block_tridiagonal import add_to_diagonal, assemble, cholesky, log
 from ..physics.membrane import TriangleMembrane
 from .grasped_frames import ClosedFrame
 from .sheet import PredictedSheet, mean_of_held
+from .tool_pull import adjoint, pull_slope
 
 WAVES = 4
 """Cosines along each side of the sheet in the smooth force fields."""
@@ -59,6 +61,8 @@ class FrameLikelihood(eqx.Module):
     """Smooth force fields, whitened: N^-1 Q."""
     among: Float[Array, "q q"]
     """Inner products of the fields: Q^T (N + H F F^T H^T)^-1 Q."""
+    adjoint: Float[Array, "n 3 3"] | None = None
+    """By how much the tool's force falls with a force on each particle [1]; None where no frame has a measured one."""
 
     def dot(
         self, left: Float[Array, "n 3 l"], right: Float[Array, "n 3 r"], white: Float[Array, "n 3 r"]
@@ -116,7 +120,10 @@ def frame_likelihood(
     It is two programs, like `normal_equations`: as one, XLA lays the factor out so that a solve takes 1.5 times as
     long.
     """
-    return _likelihood(*_around(sheet, theta, s, frame, context, x), frame, noise)
+    likelihood = _likelihood(*_around(sheet, theta, s, frame, context, x), frame, noise)
+    if frame.pull is None:
+        return likelihood
+    return replace(likelihood, adjoint=_pull_adjoint(sheet, likelihood, theta, frame, context))
 
 
 @eqx.filter_jit
@@ -160,6 +167,19 @@ def _likelihood(
         among=jnp.zeros((N_FIELDS, N_FIELDS)),
     )
     return eqx.tree_at(lambda one: one.among, likelihood, likelihood.dot(fields, fields, likelihood.white))
+
+
+@eqx.filter_jit
+def _pull_adjoint(
+    sheet: PredictedSheet,
+    likelihood: FrameLikelihood,
+    theta: Float[Array, " p"],
+    frame: ClosedFrame,
+    context: FrameContext,
+) -> Float[Array, "n 3 3"]:
+    balance, linear = likelihood.balance, likelihood.frame
+    model = sheet.model(theta, context, frame.displacement)
+    return adjoint(balance, linear, pull_slope(balance, model, frame, linear.s, linear.x))
 
 
 def seen_shift(frame: ClosedFrame, shift: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:

@@ -3,9 +3,23 @@
 from dataclasses import dataclass
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..effects.frame_history import FrameRecord
+
+
+class FramePull(eqx.Module):
+    """The force of the tool on the tissue, as it was measured in a frame."""
+
+    force: Float[Array, " 3"]
+    """The force in the world [N]; zero where none was measured."""
+    weight: Float[Array, ""]
+    """Inverse standard deviation of each component [1/N]; zero where none was measured."""
+    offset_sd: Float[Array, ""]
+    """Standard deviation of each component of what the frames of a grasp err by alike [N]: the sensor's offset, and the
+    noise of where the jaws closed."""
+    offset_number: Int[Array, ""]
+    """Number of that offset: frames of the same number err by it alike."""
 
 
 class ClosedFrame(eqx.Module):
@@ -29,6 +43,8 @@ class ClosedFrame(eqx.Module):
     """Whether the tool's report is derived from the observed positions of the held particles."""
     held_sd: Float[Array, ""]
     """Standard deviation of the mean position of what is held, by the noise of observed positions [m]."""
+    pull: FramePull | None = None
+    """Force of the tool; None where no frame of the recording has one."""
 
     @property
     def counted(self) -> Bool[Array, " n"]:

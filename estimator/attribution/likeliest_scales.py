@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from .every_frame import residual, weighed
 from .gauss_newton import Fitted
 from .noise_scales import NoiseScales, log_prior
-from .normal_equations import tool_sum
+from .normal_equations import pull_sum, tool_sum
 from .problem import AMPLITUDE
 
 STEP = float(np.log(3.0))
@@ -73,7 +73,11 @@ def likeliest_scales(fitted: Fitted, *, near: NoiseScales | None = None) -> Nois
     squared = tool_sum(fitted.problem, fitted.equations)
     degrees = 3 * len(fitted.equations)
     tool, _ = _largest(lambda variance: -0.5 * (squared / variance + degrees * np.log(variance)))
-    return NoiseScales(force=float(np.exp(log_force)), fields=float(np.exp(log_fields)), tool=tool)
+    pull, with_force = None, fitted.problem.with_force(fitted.equations)
+    if with_force:
+        of_pull = pull_sum(fitted.problem, fitted.equations)
+        pull, _ = _largest(lambda variance: -0.5 * (of_pull / variance + 3 * with_force * np.log(variance)))
+    return NoiseScales(force=float(np.exp(log_force)), fields=float(np.exp(log_fields)), tool=tool, pull=pull)
 
 
 def maximum(function: Callable[[float], float], *begun: float) -> float:

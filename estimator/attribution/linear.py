@@ -19,7 +19,8 @@ from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
 from .frame_likelihood import N_FIELDS, FrameLikelihood, seen_shift
 from .grasped_frames import ClosedFrame
-from .sheet import PredictedSheet, tool_residual
+from .sheet import PredictedSheet, closed_on, held_displacement, tool_residual
+from .tool_pull import grip_stiffness, off_balance, predicted_pull
 
 TOOL_SD = 2.5e-4
 """Standard deviation of the mean of the held particles about the tool, from frame to frame [m]."""
@@ -34,6 +35,8 @@ class NormalEquations(eqx.Module):
     """Normal equations, k = n + directions + fields + 1."""
     tool: Float[Array, "3 j"]
     """Rows of the tool's residual, over theta, fields (zero) and e, in units of `tool_sd`."""
+    pull: Float[Array, "3 k"] | None = None
+    """Rows of the residual of the tool's force, in units of its sd; None where no frame has a measured one."""
 
 
 class WeightedResiduals(eqx.Module):
@@ -47,6 +50,8 @@ class WeightedResiduals(eqx.Module):
     """Inner products of the fields with e: Q^T N^-1 e."""
     tool: Float[Array, " 3"]
     """Residual of the tool, in units of `tool_sd`."""
+    pull: Float[Array, " 3"] | None = None
+    """Residual of the tool's force, in units of its sd; None where no frame has a measured one."""
 
 
 def tool_sd(frame: ClosedFrame) -> Float[Array, ""]:
@@ -69,7 +74,10 @@ def normal_equations(
 ) -> NormalEquations:
     """Return a frame's normal equations at the state where its weights were computed."""
     columns, tool = _columns(sheet, likelihood, theta, directions, frame, context)
-    return NormalEquations(square=_inner_products(likelihood, columns), tool=tool)
+    pull = None
+    if frame.pull is not None:
+        pull = _pull_rows(sheet, likelihood, theta, directions, frame, context)
+    return NormalEquations(square=_inner_products(likelihood, columns), tool=tool, pull=pull)
 
 
 @eqx.filter_jit
@@ -92,7 +100,13 @@ def misfit(
     e = forces[:, :, None]
     products = likelihood.dot(jnp.concatenate([likelihood.fields, e], axis=2), e, likelihood.whitened(e))[:, 0]
     tool = tool_residual(sheet, model, theta, frame, context, x) / tool_sd(frame)
-    return WeightedResiduals(forces=forces, squared=products[-1], fields=products[:-1], tool=tool)
+    pull = None
+    if frame.pull is not None and likelihood.adjoint is not None:
+        predicted = predicted_pull(sheet.balance, model, frame, s, x)
+        off = jnp.where(frame.held[:, None], 0.0, unbalanced)
+        predicted = predicted - jnp.einsum("nic,ni->c", likelihood.adjoint, off)
+        pull = frame.pull.weight * (predicted - frame.pull.force)
+    return WeightedResiduals(forces=forces, squared=products[-1], fields=products[:-1], tool=tool, pull=pull)
 
 
 def parameter_forces(
@@ -134,6 +148,39 @@ def _columns(
         [dtool, jnp.zeros((3, N_FIELDS)), tool_residual(sheet, model, theta, frame, context, x)[:, None]], axis=1
     )
     return jnp.concatenate([dforce - seen, e[:, :, None]], axis=2), tool / tool_sd(frame)
+
+
+@eqx.filter_jit
+def _pull_rows(
+    sheet: PredictedSheet,
+    likelihood: FrameLikelihood,
+    theta: Float[Array, " p"],
+    directions: Float[Array, "p d"],
+    frame: ClosedFrame,
+    context: FrameContext,
+) -> Float[Array, "3 k"]:
+    """Return the rows of the residual of the tool's force, over s, theta in directions, fields (zero) and e."""
+    assert frame.pull is not None and likelihood.adjoint is not None
+    balance, linear, adjoint = likelihood.balance, likelihood.frame, likelihood.adjoint
+    x, s = linear.x, linear.s
+    model = sheet.model(theta, context, frame.displacement)
+
+    def along(u):
+        to = theta + directions @ u
+        changed, closed = sheet.model(to, context, frame.displacement), closed_on(sheet, to, frame, context)
+        grip = closed + held_displacement(changed, frame, closed, x)[None]
+        unbalanced = sheet.balance.with_energy(changed.energy).unbalanced(x, s)
+        unbalanced = unbalanced - grip_stiffness(balance, linear)[:, None] * grip
+        return unbalanced, predicted_pull(sheet.balance, changed, frame, s, x)
+
+    dforce, dpull = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
+    dtheta = dpull - jnp.einsum("nic,nid->cd", adjoint, dforce)
+    held, pulled = frame.held[:, None], (balance.reference / (1 - s))[:, None] * (x - balance.energy.rest)
+    own = jnp.where(held, model.force_factor * pulled / (1 - s)[:, None], 0.0)
+    ds = own.T - jnp.einsum("nic,ni->cn", adjoint, jnp.where(held, pulled, linear.dr_ds))
+    predicted = predicted_pull(sheet.balance, model, frame, s, x)
+    e = predicted - jnp.einsum("nic,ni->c", adjoint, off_balance(linear)) - frame.pull.force
+    return frame.pull.weight * jnp.concatenate([ds, dtheta, jnp.zeros((3, N_FIELDS)), e[:, None]], axis=1)
 
 
 @eqx.filter_jit

@@ -1,6 +1,7 @@
 """Sizes of the errors that no effect stands for, which are free in every hypothesis, and their prior.
 
-Force errors of the model, smooth force fields and the tool's reports each have a variance, over the assumed one. Its
+Force errors of the model, smooth force fields, the tool's reports and its measured force each have a variance, over the
+assumed one. Its
 logarithm is normal where only what is assumed is wrong, or, with the same probability, larger by any amount: then the
 model lacks something that has no name here.
 """
@@ -27,11 +28,14 @@ class NoiseScales:
     """Variance of the smooth force fields."""
     tool: float = 1.0
     """Variance of the tool's residual."""
+    pull: float | None = None
+    """Variance of the measured force of the tool; None where none was measured."""
 
     @property
     def values(self) -> tuple[float, ...]:
         """Return the variances in the order of the fields."""
-        return tuple(getattr(self, one.name) for one in fields(self))
+        values = (getattr(self, one.name) for one in fields(self))
+        return tuple(value for value in values if value is not None)
 
     def log_prior(self) -> float:
         """Return the log density of their logarithms [nat]."""

@@ -8,6 +8,7 @@ from .frame_likelihood import N_FIELDS
 from .grasped_frames import ClosedFrame
 from .linear import NormalEquations, grasp_sd, tool_sd
 from .problem import Problem
+from .tool_pull import pull_products
 
 FIELDS = slice(-1 - N_FIELDS, -1)
 """Place of the smooth force fields in a frame's normal equations."""
@@ -21,6 +22,9 @@ def reduced(problem: Problem, equations: dict[int, NormalEquations], d: int) -> 
         rows = np.array([np.asarray(equations[k].tool) for k in frames])
         n = len(whole) - rows.shape[2]
         whole[n:, n:] += less_offset(rows, problem.history.frames[frames[0]].frame) / problem.scales.tool
+        if problem.scales.pull is not None and problem.with_force(frames):
+            pulls = np.array([np.asarray(equations[k].pull) for k in frames])
+            whole += pull_products(pulls, [problem.history.frames[k].frame for k in frames]) / problem.scales.pull
         left = np.r_[0 : n + d, len(whole) - 1]
         middle = whole[FIELDS, FIELDS] + np.eye(N_FIELDS) / problem.amplitude**2
         beside = whole[FIELDS][:, left]
@@ -34,6 +38,15 @@ def tool_sum(problem: Problem, equations: dict[int, NormalEquations]) -> float:
     for frames in problem.by_part(equations).values():
         rows = np.array([np.asarray(equations[k].tool)[:, -1:] for k in frames])
         total += float(less_offset(rows, problem.history.frames[frames[0]].frame)[0, 0])
+    return total
+
+
+def pull_sum(problem: Problem, equations: dict[int, NormalEquations]) -> float:
+    """Return the sum of the squared residuals of the tool's force over all frames, over the assumed variances."""
+    total = 0.0
+    for frames in problem.by_part(one for one in equations if problem.with_force([one])).values():
+        rows = np.array([np.asarray(equations[k].pull)[:, -1:] for k in frames])
+        total += float(pull_products(rows, [problem.history.frames[k].frame for k in frames])[0, 0])
     return total
 
 

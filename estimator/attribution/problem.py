@@ -12,6 +12,7 @@ from ..belief.prior import prior_belief
 from ..effects import LIBRARY
 from ..effects.corrected_model import declared_effects
 from ..effects.effect import Effect
+from ..effects.force_scale import FORCE_SCALE
 from ..effects.frame_history import FrameHistory
 from ..effects.sheet_model import centred, nominal_energy
 from ..filter_builder import force_balance
@@ -28,6 +29,7 @@ NUISANCE = {
     "material_damping": (0.03,),
     "image_latency": (0.02,),
     "surface_height": (5e-4,),
+    "force_scale": (0.05,),
 }
 """Nuisance parameters, which may differ a little from 0 in any sheet: prior standard deviations in the effects'
 units."""
@@ -63,6 +65,16 @@ class Problem:
     """Sizes of the errors."""
 
     @property
+    def assumed_scales(self) -> NoiseScales:
+        """Return the sizes of the errors as they are assumed."""
+        return NoiseScales(pull=None if self.scales.pull is None else 1.0)
+
+    def with_force(self, frames: Iterable[int]) -> int:
+        """Return the number of some frames in which the force of the tool was measured."""
+        pulls = (self.history.frames[k].frame.pull for k in frames)
+        return sum(pull is not None and float(pull.weight) > 0 for pull in pulls)
+
+    @property
     def amplitude(self) -> float:
         """Return the standard deviation of the smooth force fields [force errors]."""
         return AMPLITUDE * (self.scales.fields / self.scales.force) ** 0.5
@@ -75,8 +87,12 @@ class Problem:
         energy, config = nominal_energy(mesh, estimator.declaration), estimator.config
         balance = force_balance(mesh, energy, estimator.declaration, config).inflated(FORCE_VARIANCE)
         declared, names = declared_effects(estimator.declaration), {effect.name for effect in library}
-        library = (*library, *(effect for effect in LIBRARY if effect.name in declared.keys() - names))
+        forced = dataset.frames[0].frame.pull is not None
+        needed = declared.keys() | {effect.name for effect in FORCE_SCALE}
+        library = (*library, *(effect for effect in LIBRARY if effect.name in needed - names))
         library = tuple(effect for effect in library if estimator.declaration.hangs or not effect.hanging)
+        library = tuple(effect for effect in library if forced or not effect.needs_force)
+        declared = {one.name: declared[one.name] for one in library if one.name in declared}
         sheet = PredictedSheet(balance=balance, view=centred(mesh), library=library, declared=declared)
         alike = replace(config.prior, sheet_strength=SHEET_STRENGTH)
         own = {name: sd for name, sd in NUISANCE.items() if any(effect.name == name for effect in library)}
@@ -88,6 +104,7 @@ class Problem:
             prior_sd=np.concatenate([np.ravel(effect.prior_sds) for effect in library]),
             own=np.concatenate([[], *(sheet.place(name) for name in own)]).astype(int),
             own_sd=np.concatenate([[], *(np.asarray(sd) for sd in own.values())]),
+            scales=NoiseScales(pull=1.0 if forced else None),
         )
 
     def with_scales(self, scales: NoiseScales) -> "Problem":

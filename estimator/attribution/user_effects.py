@@ -48,11 +48,20 @@ def _check(effect: Effect, plain: SheetModel, context: FrameContext, x: jax.Arra
 
     def outputs(theta: jax.Array) -> jax.Array:
         model = effect.acts(plain, theta, context)
-        parts = (model.energy.internal_gradient(x), look(model, x), model.tool, model.energy.rest)
+        parts = (model.energy.internal_gradient(x), look(model, x), model.tool, model.energy.rest, model.force_factor)
         return jnp.concatenate([part.ravel() for part in parts])
 
     without = jnp.concatenate(
-        [part.ravel() for part in (plain.energy.internal_gradient(x), look(plain, x), plain.tool, context.rest)]
+        [
+            part.ravel()
+            for part in (
+                plain.energy.internal_gradient(x),
+                look(plain, x),
+                plain.tool,
+                context.rest,
+                plain.force_factor,
+            )
+        ]
     )
     if not np.allclose(outputs(zero), without, rtol=0, atol=ROUNDING):
         raise ValueError(f"Effect {effect.name} must change nothing where all its parameters are 0.")

@@ -1,6 +1,7 @@
 """Effects that the declared model of a sheet may lack; `effect.py` says how to add one."""
 
 from .effect import Effect
+from .force_scale import FORCE_SCALE
 from .foundation import FOUNDATION
 from .history_dependent import HISTORY_DEPENDENT
 from .mechanical import MECHANICAL
@@ -14,6 +15,7 @@ LIBRARY: tuple[Effect, ...] = (
     *HISTORY_DEPENDENT,
     *SENSING,
     *YIELDING,
+    *FORCE_SCALE,
     *SWING,
 )
 """All effects that are tested by default. They act on the model in this order; `swing` is last, because it acts at the

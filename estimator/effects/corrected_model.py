@@ -16,7 +16,7 @@ from . import LIBRARY
 from .effect import Effect, with_effects
 from .sheet_model import FrameContext, SheetModel, View, centred, nominal_energy
 
-PARTS = ("energy", "tool", "view")
+PARTS = ("energy", "tool", "view", "force_factor")
 """Parts of a model that an effect may change."""
 PROBE_STRETCH = 1.5
 """Factor by which the sheet is larger than at rest in the frame that shows what an effect changes: beyond every limit
@@ -73,12 +73,17 @@ class CorrectedModel(eqx.Module):
         """Return the energy with the effects as they act on the sheet at rest."""
         return self.model(resting(self.energy.rest), jnp.zeros(3)).energy
 
+    @property
+    def force_factor(self) -> float:
+        """Return the factor on all stiffnesses that the effects declare."""
+        return float(self.model(resting(self.energy.rest), jnp.zeros(3)).force_factor)
+
     def that_change(self, part: str) -> list[str]:
-        """Return the names of the effects that change the model's `energy`, `tool` or `view`."""
+        """Return the names of the effects that change one of the model's `PARTS`."""
         return [effect.name for effect in self.effects if self.changes(effect, part)]
 
     def changes(self, effect: Effect, part: str) -> bool:
-        """Return whether one of the effects changes the model's `energy`, `tool` or `view`, in a frame of a lift."""
+        """Return whether one of the effects changes one of the model's `PARTS`, in a frame of a lift."""
         start = sum(one.size for one in self.effects[: self.effects.index(effect)])
         context = _probe(self.energy.rest)
         tool = context.reports[-1]

@@ -69,6 +69,8 @@ class Effect:
     """Whether it applies only to a sheet with weight and no bed under it."""
     sensing: bool = False
     """Whether it is of the tool, the camera or the tracker; its size then holds for one session alone."""
+    needs_force: bool = False
+    """Whether it shows in a measured force of the tool alone."""
     needs_later_reports: bool = False
     """Whether it needs what the tool reports after the frame, which an estimate does not have yet."""
 

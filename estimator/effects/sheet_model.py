@@ -4,6 +4,7 @@ The energy has its terms by type, so that an effect finds the one that it change
 from the start, with zero energy.
 """
 
+from functools import partial
 from typing import TypeVar
 
 import equinox as eqx
@@ -69,6 +70,8 @@ class SheetModel(eqx.Module):
     """How positions are observed."""
     time: Float[Array, ""]
     """Time of the observed state, by the clock of the tool's reports [s]."""
+    force_factor: Float[Array, ""] = eqx.field(default_factory=partial(jnp.ones, ()))
+    """Measured force of the tool over that of the model."""
 
     def has(self, kind: type[Term]) -> bool:
         """Return whether the energy has a term of a type: a sheet in the air has no bed."""

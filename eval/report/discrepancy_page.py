@@ -69,6 +69,7 @@ def story(found: Mapping[str, Any]) -> list[str]:
     if found["explanation"]:
         sentences.append(explanation_sentence(found["explanation"][0], found["localisation"]["particles"]))
     sentences += _held_out_sentences(found)
+    sentences.append(_stiffness_sentence(found["force"]))
     if found["suggestion"] is not None:
         sentences.append(_suggestion_sentence(found["suggestion"]))
     if not found["noise"]["still_frames"]:
@@ -123,6 +124,25 @@ def _held_out_sentences(found: Mapping[str, Any]) -> list[str]:
     if least < remainder:
         sentences.append(f"That {words} predicts this part better than the model does: do not rely on its attachments.")
     return sentences
+
+
+def _stiffness_sentence(force: Mapping[str, Any] | None) -> str:
+    """Return whether stiffnesses are in N/m or relative, by the measured force of the tool."""
+    relative = "Stiffnesses and weights are relative to the declared membrane stiffness"
+    if force is None:
+        return f"{relative}: no force on the tool was measured."
+    if force["why_not"] is not None:
+        return f"{relative}, and the measured force of the tool does not change that: {force['why_not']}"
+    sd, errors = force["stiffness_factor_log_sd"], force["held_out_rms_n"]
+    held_out = ""
+    if errors["measured"] is not None:
+        after, measured = 1e3 * errors["after"], 1e3 * errors["measured"]
+        held_out = f" In the last part the force, of {measured:.3g} mN (RMS), is predicted to {after:.2g} mN."
+    return (
+        f"Stiffnesses are absolute, by the measured force of the tool: they are {force['stiffness_factor']:.3g} times "
+        f"what is declared, within {100 * sd:.2g} %, and the membrane's is {force['membrane_stiffness_n_per_m']:.3g} "
+        f"N/m.{held_out}"
+    )
 
 
 def _attachments_sentence(found: Mapping[str, Any]) -> str:

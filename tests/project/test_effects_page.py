@@ -23,7 +23,9 @@ def test_the_page_lists_the_library():
 def test_effects_have_the_names_of_the_disturbances_that_cause_them():
     """Three have none of their own.
 
-    They are `swing`, since the sheets of the scenes lie, `surface_height`, which any sheet has, and `tethering`, which
-    is the disturbance `adhesion` with a film that does not come off.
+    They are `swing`, since the sheets of the scenes lie, `surface_height`, which any sheet has, `tethering`, which
+    is the disturbance `adhesion` with a film that does not come off, and `force_scale`, which is a wrong declaration.
     """
-    assert {effect.name for effect in LIBRARY} - {"swing", "surface_height", "tethering"} <= set(DISTURBANCES)
+    assert {effect.name for effect in LIBRARY} - {"swing", "surface_height", "tethering", "force_scale"} <= set(
+        DISTURBANCES
+    )

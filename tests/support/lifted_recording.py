@@ -16,7 +16,7 @@ from jiggle_mj.estimator.effects import LIBRARY, Effect
 from jiggle_mj.estimator.filters.evidence import Evidence
 from jiggle_mj.estimator.physics.energy import SheetEnergy
 from jiggle_mj.estimator.physics.environment import Tether, Weight
-from jiggle_mj.observation import MeasuredPoints, Observation, ToolState
+from jiggle_mj.observation import MeasuredForce, MeasuredPoints, Observation, ToolState
 from tests.support.small_sheet import (
     DECLARATION,
     GRIP_RADIUS,
@@ -30,6 +30,10 @@ from tests.support.small_sheet import (
 
 NOISE = 1e-4
 """Standard deviation of each observed coordinate [m]."""
+FORCE_NOISE = 5e-4
+"""Standard deviation of each component of a measured force [N]; the lifts pull with up to 0.03 N."""
+OFFSET = np.array([0.02, -0.01, 0.05])
+"""What the sensor of the force shows while nothing pulls [N]."""
 N_STILL = 10
 """Still frames before the first grasp."""
 PERIOD_NS = 250_000_000
@@ -42,6 +46,12 @@ SMALL_LIBRARY = tuple(
 """Effects that the tests search for; fewer than the library, to save time."""
 
 
+def lifted_energy(gravity: float) -> SheetEnergy:
+    """Return the energy of the sheet under a share of the declared gravity."""
+    kinds = [type(term) for term in sheet_energy().terms]
+    return eqx.tree_at(lambda e: e.terms[kinds.index(Weight)].gravity, sheet_energy(), replace_fn=lambda g: gravity * g)
+
+
 @cache
 def lifted(gravity: float, tethering: float = 0.0) -> tuple[np.ndarray, ...]:
     """Return the states of the shared lifts; what is held follows the tip.
@@ -50,10 +60,7 @@ def lifted(gravity: float, tethering: float = 0.0) -> tuple[np.ndarray, ...]:
         gravity: share of the declared gravity.
         tethering: stiffness per area of springs that tie all of the sheet to its rest shape [N/m^3].
     """
-    kinds = [type(term) for term in sheet_energy().terms]
-    energy = eqx.tree_at(
-        lambda e: e.terms[kinds.index(Weight)].gravity, sheet_energy(), replace_fn=lambda g: gravity * g
-    )
+    energy = lifted_energy(gravity)
     if tethering:
         springs = tethering * jnp.asarray(sheet().particle_area)[:, None, None] * jnp.eye(3)[None]
         tether = eqx.tree_at(lambda t: t.stiffness, Tether.build(sheet().rest), springs)
@@ -71,10 +78,11 @@ def lifted(gravity: float, tethering: float = 0.0) -> tuple[np.ndarray, ...]:
     return tuple(states)
 
 
-def observed(gravity: float, *, tool_scale: float = 1.0, tethering: float = 0.0) -> list[Observation]:
-    """Return still frames, then the lifts: noisy tracked points, and the tool as it reports."""
+def observed(gravity: float, *, tool_scale: float = 1.0, tethering: float = 0.0, repeats: int = 1) -> list[Observation]:
+    """Return still frames, then the lifts, each seen `repeats` times: noisy tracked points, and the tool's reports."""
     frames = [(sheet().rest, np.array([0.0, 0.0, 0.05]), 0)] * N_STILL
-    frames += [(x, lift.tip, lift.grasp) for x, lift in zip(lifted(gravity, tethering), lifts(), strict=True)]
+    states = zip(lifted(gravity, tethering), lifts(), strict=True)
+    frames += [(x, lift.tip, lift.grasp) for x, lift in states for _ in range(repeats)]
     first = {grasp: tip for _, tip, grasp in frames[::-1]}
     return [
         Observation(
@@ -94,6 +102,23 @@ def observed(gravity: float, *, tool_scale: float = 1.0, tethering: float = 0.0)
             ),
         )
         for k, (x, tip, grasp) in enumerate(frames)
+    ]
+
+
+def with_forces(observations: list[Observation], factor: float) -> list[Observation]:
+    """Return lifts with the force on the tool of a sheet that is a factor as stiff and as heavy in everything.
+
+    What the balance of the held particles lacks, with the offset and the noise of a sensor.
+    """
+    balance, b, draw = balance_of(sheet_energy(), 1e-4), STIFFNESS * attached(), np.random.default_rng(9)
+    s = jnp.asarray(b / (b + DECLARATION.membrane_stiffness))
+    lacks = eqx.filter_jit(lambda x: balance.unbalanced(x, s) / (1 - s)[:, None])
+    lifted_pulls = [np.asarray(lacks(x))[lift.held].sum(axis=0) for x, lift in zip(lifted(1.0), lifts(), strict=True)]
+    repeats = (len(observations) - N_STILL) // len(lifted_pulls)
+    pulls = np.concatenate([np.zeros((N_STILL, 3)), np.repeat(lifted_pulls, repeats, axis=0)])
+    return [
+        dataclasses.replace(one, force=MeasuredForce(on_tool=OFFSET - factor * pull + noise, sd=FORCE_NOISE))
+        for one, pull, noise in zip(observations, pulls, FORCE_NOISE * draw.normal(size=pulls.shape), strict=True)
     ]
 
 

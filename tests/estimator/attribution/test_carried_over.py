@@ -63,6 +63,12 @@ def test_effects_that_predict_the_reported_part_worse_are_taken_out_again():
     assert carried_over(path, []) == (path, [], {})
 
 
+def test_the_force_decides_whether_its_scale_carries_over():
+    path = hypothesis("force_scale").path
+    assert carried_over(path, held_out(4.8, 4.9), [0.02, 0.01])[0] == path
+    assert carried_over(path, held_out(4.8, 4.7), [0.02, 0.03])[0] == path[:1]
+
+
 def test_each_effect_that_was_fitted_and_is_not_named_has_a_reason():
     best, rival, pair = hypothesis("gravity", nat=9.0), hypothesis("stretch", nat=8.0), hypothesis("gravity", "bed")
     fitted = [(best, 0.6), (rival, 0.3), (pair, 0.1), (hypothesis("bed", nat=2.0), 0.0)]

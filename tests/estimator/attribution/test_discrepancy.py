@@ -26,6 +26,8 @@ def test_the_file_and_the_page_hold_the_result(light, tmp_path):
     closed, found, _ = light
     assert json.loads(json.dumps(found)) == found
     assert {"verdict", "effects", "ambiguous_with", "tested", "held_out", "localisation"} <= set(found)
+    assert found["force"] is None and "force_scale" not in found["tested"]
+    assert any("relative" in line and "no force on the tool was measured" in line for line in story(found))
     correlations = found["localisation"]["correlates_with"]
     assert correlations["height"] is not None and abs(correlations["height"]) <= 1
     for name in ("a", "b"):

@@ -83,6 +83,7 @@ def observables(effect: Effect, plain: SheetModel, context: FrameContext):
             seen / length,
             model.tool / length,
             model.energy.rest / length,
+            model.force_factor,
         )
         return jnp.concatenate([part.ravel() for part in parts])
 
