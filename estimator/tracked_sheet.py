@@ -53,6 +53,8 @@ class TrackedSheet:
     """Positions with open jaws when they were last asked for, at first at rest [m]."""
     corrected: CorrectedFrames | None
     """The frames under the declared effects; None where none is declared."""
+    declared_scale: StiffnessScale | None = None
+    """The factor on all stiffnesses of a declared `force_scale`; None where none is declared."""
 
     @classmethod
     def seen_by(cls, perception: Perception, declaration: Declaration, config: EstimatorConfig) -> "TrackedSheet":
@@ -92,6 +94,7 @@ class TrackedSheet:
             x=mesh.rest,
             open_x=mesh.rest,
             corrected=None if model is None else CorrectedFrames(model=model, rest_time=rest_time),
+            declared_scale=None if model is None else _declared_scale(model),
         )
 
     def update(
@@ -135,15 +138,15 @@ class TrackedSheet:
 
     @property
     def stiffness_scale(self) -> StiffnessScale | None:
-        """The factor that the tool's force puts on all stiffnesses of the present belief; None for 1.
+        """The factor on all stiffnesses of the present belief by the tool's force, else as declared; None for 1.
 
-        It is not kept from a refinement on: what later frames show of the attachments shows it as well.
+        That of the force is not kept from a refinement on: what later frames show of the attachments shows it as well.
         """
         fit, belief = self.filter.force(self.state), self.state.summary.belief
         if fit is None or isinstance(belief, GaussianBelief):
-            return None
+            return self.declared_scale
         with jax.enable_x64(True):
-            return fit.scale(belief)
+            return fit.scale(belief) or self.declared_scale
 
     def take(self, state: FilterState, summary: PosteriorSummary | None) -> None:
         """Take the state after a refinement.
@@ -153,6 +156,12 @@ class TrackedSheet:
         """
         self.state = state
         refuse_not_finite(summary)
+
+
+def _declared_scale(model: CorrectedModel) -> StiffnessScale | None:
+    if not model.that_change("force_factor"):
+        return None
+    return StiffnessScale(factor=model.force_factor, log_sd=0.0, log_with_s=np.zeros(len(model.energy.rest)))
 
 
 def unfolded(sheet: Sheet) -> tuple[SheetMesh, SheetPlane]:

@@ -1,7 +1,5 @@
 """An estimate of a recording under the corrected model, from which the report has its attachments."""
 
-from dataclasses import replace
-
 from jiggle_mj.errors import OptionError, PerceptionError
 from jiggle_mj.estimate import Detection
 from jiggle_mj.estimator import Estimator, EstimatorConfig
@@ -15,8 +13,6 @@ def corrected_detection(
 ) -> Detection | str:
     """Return which particles are attached under the corrected model, or why an estimate cannot have that model.
 
-    The tool's force is left out, as it is in closing the loop: sizes of effects are of the declared stiffness.
-
     Args:
         recording: that the loop was closed over.
         corrected: the declaration with the effects.
@@ -29,7 +25,7 @@ def corrected_detection(
     try:
         estimator = Estimator(corrected, recording.camera, config=config, mask=mask)
         for observation in recording:
-            estimator.update(replace(observation, force=None))
+            estimator.update(observation)
         estimator.release()
         return estimator.detection
     except (OptionError, PerceptionError) as refusal:

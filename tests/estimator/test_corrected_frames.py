@@ -108,6 +108,13 @@ def test_gravity_declared_as_an_effect_is_the_declared_gravity():
     assert abs(mean_b(by_effect) - mean_b(estimator)) < REMAINING * abs(mean_b(undeclared) - mean_b(estimator))
 
 
+def test_a_declared_scale_of_all_forces_multiplies_every_stiffness_and_moves_nothing(flawless):
+    estimator, states = flawless
+    scaled, found = followed(observed(1.0), force_scale=(float(np.log(2)),))
+    np.testing.assert_allclose(found, states, rtol=0, atol=SAME)
+    np.testing.assert_allclose(scaled.detection.stiffness, 2 * estimator.detection.stiffness, rtol=SAME, atol=SAME)
+
+
 @pytest.mark.bits
 def test_the_estimate_without_effects_is_to_the_bit_that_of_fusion_and_filter_alone():
     """Perception, fusion and the filter of the declaration, fed frame by frame by hand."""
