@@ -1,6 +1,9 @@
 """The measured data that docs/RECORDINGS.md describes, where a machine has them."""
 
 import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,8 @@ DOCUMENTED = CHECKOUT / "docs" / "recordings"
 MEASURED = os.environ.get("JIGGLE_MJ_MEASURED")
 MILLIMETRE = 1e-3
 """Absolute tolerance of lengths that the documents give in whole millimetres [m]."""
+FORCE_ROUNDING = 5e-4
+"""Absolute tolerance of a force that a document gives in whole millinewtons [N]."""
 PATH_ROUNDING = 1e-9
 """Absolute tolerance of a point of a given path of 19 mm [m]: its direction is given with three digits."""
 
@@ -73,7 +78,6 @@ def test_the_documented_rubber_strip_reaches_both_grips(tmp_path):
         ("skin_1013", 22, 240, [26, 40, 41, 56], 30),
         ("skin_1014", 19, 239, None, 28),
         ("lift_4", 23, 354, [90, 91, 112, 113], 64),
-        ("human_skin", 50, 537, [], 34),
     ],
 )
 def test_descriptions_that_init_began_are_imported(tmp_path, name, n_frames, n_points, held, n_attached):
@@ -81,3 +85,16 @@ def test_descriptions_that_init_began_are_imported(tmp_path, name, n_frames, n_p
     assert (summary.n_frames, summary.n_points, summary.n_attached) == (n_frames, n_points, n_attached)
     first = next(iter(Recording.open(summary.recording)))
     assert held is None or list(first.tool.held_tracks) == held
+
+
+def test_the_human_skin_has_the_force_of_each_frame(tmp_path):
+    """The pad pulls towards -x, at first with nothing; at 3.82 mm the force is 73 mN, and acts against it."""
+    folder = tmp_path / "human_skin"
+    shutil.copytree(measured("human_skin"), folder)
+    subprocess.run([sys.executable, CHECKOUT / "tools" / "force_of_frames.py", folder], check=True)
+    summary = import_folder(folder, DOCUMENTED / "human_skin.toml", tmp_path / "run.mcap")
+    assert (summary.n_frames, summary.n_points, summary.n_attached) == (50, 537, 34)
+    seen = list(Recording.open(summary.recording))
+    forces = np.array([one.force.on_tool for one in seen])
+    assert not seen[0].tool.held_tracks and not forces[0].any() and not forces[:, 1:].any()
+    assert forces[-1, 0] == pytest.approx(0.073, abs=FORCE_ROUNDING) and (np.diff(forces[:, 0]) > 0).all()
