@@ -30,7 +30,8 @@ def force_report(closed: Closed, dataset: Dataset) -> dict[str, Any] | None:
     own_sd = _log_sd(last)
     frames = [k for k in range(len(dataset.frames)) if closed.problem.with_force([k])]
     before, after = (predicted_forces(one, frames) for one in (closed.declared.fitted, last))
-    measured, spare = measured_forces(last, frames), [row for row, k in enumerate(frames) if k not in last.equations]
+    measured, part = measured_forces(last, frames), dataset.frames[-1].part
+    spare = [row for row, k in enumerate(frames) if dataset.frames[k].part == part and k not in last.equations]
     errors = {"measured": measured, "before": measured - before, "after": measured - after}
     return {
         "used": True,

@@ -31,6 +31,7 @@ from .every_frame import residual
 from .frame_likelihood import N_FIELDS, FrameLikelihood
 from .gauss_newton import Weighed
 from .normal_equations import offset_share
+from .tool_pull import pull_products
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,8 @@ class LikelihoodSplit:
     particles: Float[np.ndarray, "frames n"]
     """Part of each particle in each frame."""
     shared: Float[np.ndarray, " frames"]
-    """Part of each frame that belongs to no particle: the tool's reports, and the noise that neighbours share."""
+    """Part of each frame that belongs to no particle: the tool's reports and force, and the noise that neighbours
+    share."""
     grasps: float
     """What belongs to no frame: the fields and offsets that the frames of a grasp share."""
 
@@ -64,6 +66,13 @@ def likelihood_split(fit: Weighed) -> LikelihoodSplit:
         offset = share * reports.sum(axis=0)
         for k, apart in zip(frames, reports - offset, strict=True):
             fields[k], tool[k] = c, -0.5 * float(apart @ apart / variance + 3 * np.log(variance))
+        if problem.scales.pull is not None and problem.with_force(frames):
+            pulls = np.array([np.asarray(every[k].pull)[:, None] for k in frames])
+            for k, own in zip(frames, pulls[:, :, 0], strict=True):
+                constant = 3 * problem.with_force([k]) * np.log(problem.scales.pull)
+                tool[k] -= 0.5 * float(own @ own / problem.scales.pull + constant)
+            whole = pull_products(pulls, [problem.history.frames[k].frame for k in frames])[0, 0]
+            grasps -= 0.5 * float(whole - np.sum(pulls**2)) / problem.scales.pull
         log_det = np.linalg.slogdet(np.eye(N_FIELDS) + problem.amplitude**2 * among)[1]
         grasps -= 0.5 * float(c @ c / problem.amplitude**2 + log_det + offset @ offset / (ratio * variance))
 
