@@ -168,12 +168,12 @@ def test_stiffnesses_twice_as_large_as_declared_are_found_by_the_force():
         ),
     ],
 )
-def test_a_force_that_cannot_be_used_is_named_and_changes_nothing(changed, why, unforced):
+def test_a_force_that_cannot_be_used_is_named_and_in_no_frame(changed, why, unforced):
     forced = [replace(one, force=changed(one.force, one.tool.closed)) for one in with_forces(observed(1.0), 1.0)]
     library = tuple(effect for effect in LIBRARY if effect.name in AT_EACH_STATE)
     given = collect_dataset(DECLARATION, None, forced)
     assert why in given.force_doubt and unforced.force_doubt is None
-    left, right = (jax.tree.leaves((one.frames[-1].frame, one.detection.stiffness)) for one in (given, unforced))
+    left, right = (jax.tree.leaves(one.frames[-1].frame) for one in (given, unforced))
     for a, b in zip(left, right, strict=True):
         np.testing.assert_array_equal(a, b)
     problem = Problem.build(given, library)
