@@ -73,7 +73,7 @@ def likeliest_scales(fitted: Fitted, *, near: NoiseScales | None = None) -> Nois
     squared = tool_sum(fitted.problem, fitted.equations)
     degrees = 3 * len(fitted.equations)
     tool, _ = _largest(lambda variance: -0.5 * (squared / variance + degrees * np.log(variance)))
-    pull, with_force = None, fitted.problem.with_force(fitted.equations)
+    pull, with_force = own.pull, fitted.problem.with_force(fitted.equations)
     if with_force:
         of_pull = pull_sum(fitted.problem, fitted.equations)
         pull, _ = _largest(lambda variance: -0.5 * (of_pull / variance + 3 * with_force * np.log(variance)))

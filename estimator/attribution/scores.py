@@ -8,8 +8,8 @@ for each site, and the mean of the Bayes factors over the sites. An effect whose
 also fitted from its initial guesses, for a few steps.
 
 The errors have their likeliest variances, so that the score of one effect is a lower bound of what a fit gains by it:
-without it, all that it would explain counts as errors. The tool's residuals are so few that this bound is low. Their
-variance is the assumed one where the likeliest is larger.
+without it, all that it would explain counts as errors. The residuals of the tool and of its force are so few that this
+bound is low. Their variances are the assumed ones where the likeliest are larger.
 """
 
 from dataclasses import dataclass, replace
@@ -69,7 +69,7 @@ class Score:
 
 def scores(fitted: Fitted) -> list[Score]:
     """Return the scores of all effects that are not in the fit, the likeliest first."""
-    fitted = _with_tool_as_assumed(fitted)
+    fitted = _with_usual_tool(fitted)
     problem, n = fitted.problem, len(fitted.site_precision)
     equations = linearised(problem, fitted.point, fitted.weights, directions(problem, np.arange(problem.sheet.size)))
     square = reduced(problem, equations, problem.sheet.size)
@@ -82,12 +82,13 @@ def scores(fitted: Fitted) -> list[Score]:
     return sorted((_from_initial_guesses(fitted, one) for one in found), key=lambda one: -one.log_bayes_factor)
 
 
-def _with_tool_as_assumed(fitted: Fitted) -> Fitted:
-    """Return a fit with a variance of the tool's residuals that is not larger than assumed."""
-    scales = fitted.problem.scales
-    if scales.tool <= 1:
+def _with_usual_tool(fitted: Fitted) -> Fitted:
+    """Return a fit with variances of the residuals of the tool and of its force that are not larger than assumed."""
+    last = fitted.problem.scales
+    scales = replace(last, tool=min(last.tool, 1.0), pull=None if last.pull is None else min(last.pull, 1.0))
+    if scales == last:
         return fitted
-    problem = fitted.problem.with_scales(replace(scales, tool=1.0))
+    problem = fitted.problem.with_scales(scales)
     return fit_at(weighed_with(problem, fitted.point, fitted.weights), fitted.named, fitted.equations)
 
 

@@ -6,6 +6,7 @@ arrays have an entry for each hypothesis and each of its two fits.
 
 import io
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +94,7 @@ def _about(one: KeptFit) -> dict[str, Any]:
         "theta": known.theta.tolist(),
         "precision": known.precision.tolist(),
         "slope": known.slope.tolist(),
-        "scales": [getattr(one, end).scales.values for end in ENDS],
+        "scales": [asdict(getattr(one, end).scales) for end in ENDS],
     }
 
 
@@ -107,10 +108,8 @@ def _fit(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> KeptFit:
         slope=np.array(about["slope"], dtype=float),
     )
     ends = {
-        end: KeptPoint(
-            scales=NoiseScales(force=force, fields=fields, tool=tool), **{name: arrays[name][k] for name in POINT}
-        )
-        for k, (end, (force, fields, tool)) in enumerate(zip(ENDS, about["scales"], strict=True))
+        end: KeptPoint(scales=NoiseScales(**about_end), **{name: arrays[name][k] for name in POINT})
+        for k, (end, about_end) in enumerate(zip(ENDS, about["scales"], strict=True))
     }
     return KeptFit(
         effects=tuple(sorted((*shared, *own))),
