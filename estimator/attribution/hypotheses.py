@@ -145,6 +145,14 @@ def search(declared: Hypothesis, observed: ObservedStates, log: Log) -> list[Hyp
         beam = sorted(new, key=posterior, reverse=True)[:BEAM]
         if not beam or posterior(beam[0]) < best:
             break
+        if len(beam[0].added) == 1:
+            again = left_out(beam[0], beam[0].added[0], log)
+            if posterior(again) > posterior(beam[0]):
+                log("the declared model fits better from there: the search begins anew")
+                return search(again, observed, log)
+            if again.log_evidence > declared.log_evidence:
+                found = {frozenset(one.names): one for one in with_declared(list(found.values()), again)}
+                beam = [found[frozenset(one.names)] for one in beam]
     while len((last := max(found.values(), key=posterior)).added) > 1:
         for one in last.added:
             key = frozenset(last.names) - {one.effect.name}
@@ -152,8 +160,6 @@ def search(declared: Hypothesis, observed: ObservedStates, log: Log) -> list[Hyp
                 found[key] = left_out(last, one, log)
         if max(found.values(), key=posterior) is last:
             break
-    if len(last.added) == 1 and (again := left_out(last, last.added[0], log)).log_evidence > declared.log_evidence:
-        return with_declared(list(found.values()), again)
     return list(found.values())
 
 
@@ -165,9 +171,8 @@ def confused(one: Hypothesis) -> list[Score]:
 
 
 def with_declared(found: list[Hypothesis], again: Hypothesis) -> list[Hypothesis]:
-    """Return hypotheses, the first of which has another fit of the declared model."""
-    now: dict[Hypothesis | None, Hypothesis | None] = {None: None}
-    now[found[0]] = replace(found[0], fits=again.fits, log_evidence=again.log_evidence)
+    """Return hypotheses, the first of which is another fit of the declared model, with the scores of the one before."""
+    now: dict[Hypothesis | None, Hypothesis | None] = {None: None, found[0]: replace(again, scores=found[0].scores)}
     result = list[Hypothesis]()
     for one in sorted(found, key=lambda one: len(one.added)):
         changed = now.get(one) or replace(one, before=now[one.before])

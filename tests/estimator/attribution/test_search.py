@@ -12,6 +12,7 @@ from jiggle_mj.estimator.attribution.hypotheses import (
     with_declared,
 )
 from jiggle_mj.estimator.attribution.scores import Score
+from jiggle_mj.estimator.attribution.starts import ObservedStates
 from tests.support.made_up_hypotheses import EFFECTS, hypothesis
 
 NO_STEP = {"site": 0, "theta": np.zeros(1), "p_value": 1.0, "kept": 1.0}
@@ -91,10 +92,12 @@ def test_fits_to_all_frames_are_not_fitted_again(monkeypatch):
 def test_another_fit_of_the_declared_model_is_before_all_others():
     one = hypothesis("gravity", nat=5, before=(nothing := hypothesis()))
     pair = hypothesis("gravity", "bed", nat=9, before=one)
+    nothing.scores.append(Score(name="bed", log_bayes_factor=1.0, **NO_STEP))
     again = hypothesis(nat=2)
     now = with_declared([nothing, pair, one], again)
     assert [found.names for found in now] == [(), ("gravity",), ("gravity", "bed")]
     assert [found.log_evidence for found in now] == [2, 5, 9] and now[0].fits is again.fits
+    assert now[0].scores == nothing.scores
     assert now[2].path == now
 
 
@@ -104,3 +107,30 @@ def test_effects_that_the_best_is_confused_with_are_those_that_show_at_all():
     nothing.scores.extend(Score(name=name, log_bayes_factor=nat, **NO_STEP) for name, nat in scores.items())
     assert {"bed", "stretch"} <= set(EFFECTS["gravity"].confounded_with)
     assert [one.name for one in confused(hypothesis("gravity", before=nothing))] == ["bed"]
+
+
+def test_a_search_begins_anew_where_the_declared_model_fits_better_without_the_best_effect(monkeypatch):
+    """An effect that ends at a size of 0 has found no effect, but a better fit of what is declared."""
+    begun, left = list[float](), {10.0: 400.0, 400.0: 395.0}
+    gain = {10.0: 390.0, 400.0: 50.0}
+
+    def scored(one: Hypothesis, log: object) -> list[Score]:
+        begun.append(one.log_evidence)
+        return [] if one.added else [Score(name="tethering", log_bayes_factor=30.0, **NO_STEP)]
+
+    monkeypatch.setattr(hypotheses, "likely", scored)
+    monkeypatch.setattr(
+        hypotheses,
+        "added_to",
+        lambda before, score, *_: hypothesis(
+            score.name, nat=before.log_evidence + gain[before.log_evidence], before=before
+        ),
+    )
+    monkeypatch.setattr(hypotheses, "left_out", lambda last, *_: hypothesis(nat=left[last.path[0].log_evidence]))
+    declared = hypothesis(nat=10.0)
+    nowhere = ObservedStates(
+        problem=declared.fitted.problem, point=declared.fitted.point, frames=[], square=np.zeros((2, 2))
+    )
+    found = hypotheses.search(declared, nowhere, lambda text: None)
+    assert [(one.names, one.log_evidence) for one in found] == [((), 400.0), (("tethering",), 450.0)]
+    assert begun == [10.0, 400.0, 450.0]
