@@ -14,7 +14,7 @@ from ..effects import Effect
 from ..parallel_map import parallel_map
 from .evidence import log_model_evidence
 from .fit import Fits, fit, fit_to_more, without
-from .gauss_newton import Fitted, moved
+from .gauss_newton import Fitted, linearise_at, moved
 from .problem import Problem
 from .scores import MIN_SCORE, Score, scores
 from .starts import ObservedStates, stepped
@@ -242,13 +242,20 @@ def added_to(before: Hypothesis, score: Score, observed: ObservedStates, worth: 
 
 def left_out(last: Hypothesis, one: AddedEffect, log: Log) -> Hypothesis:
     """Return a hypothesis without one of its effects, fitted again; to its end only if not hopeless."""
-    begun = last.fits.assumed
-    named = begun.named[~np.isin(begun.named, one.at)]
-    worth = last.fitted.log_posterior - HOPELESS
-    begin = moved(begun, one.at, np.zeros(len(one.at)))
-    fits = fit(begun.problem, named, [begin], list(begun.equations), before=last.path[0].fits, worth=worth)
+    begun, nothing, none = last.fits, np.zeros(len(one.at)), last.path[0]
+    problem, frames = begun.assumed.problem, list(begun.assumed.equations)
+    named = begun.assumed.named[~np.isin(begun.assumed.named, one.at)]
+    there = linearise_at(last.fitted.problem, named, moved(last.fitted, one.at, nothing), frames)
+    fits = fit(
+        problem,
+        named,
+        [moved(begun.assumed, one.at, nothing)],
+        frames,
+        before=Fits(assumed=none.fits.assumed, likeliest=there),
+        worth=last.fitted.log_posterior - HOPELESS,
+    )
     rest = tuple(other for other in last.added if other is not one)
-    result = hypothesis_of(fits, rest, last.path[0] if rest else None)
+    result = hypothesis_of(fits, rest, none if rest else None)
     _report(result, log)
     return result
 

@@ -1,22 +1,32 @@
 """Search over hypotheses: the frames that it is over, and what of it is fitted to all frames."""
 
+from dataclasses import replace
+
+import jax
 import numpy as np
 import pytest
 
+from jiggle_mj.estimator.attribution import fit as fitting
 from jiggle_mj.estimator.attribution import hypotheses
+from jiggle_mj.estimator.attribution.fit import Fits
+from jiggle_mj.estimator.attribution.gauss_newton import linearise_at, moved, start
 from jiggle_mj.estimator.attribution.hypotheses import (
     Hypothesis,
     confused,
+    left_out,
     of_all_frames,
     searched_frames,
     with_declared,
 )
 from jiggle_mj.estimator.attribution.scores import Score
 from jiggle_mj.estimator.attribution.starts import ObservedStates
+from jiggle_mj.estimator.blas import one_thread
 from tests.support.made_up_hypotheses import EFFECTS, hypothesis
 
 NO_STEP = {"site": 0, "theta": np.zeros(1), "p_value": 1.0, "kept": 1.0}
 """What the search does not use of a score."""
+SCALES_ERROR = 0.5
+"""Error of the likeliest variances, by which a fit may end below its start [nat]."""
 
 
 @pytest.mark.parametrize("largest", [1, 3, 5, 1000])
@@ -134,3 +144,19 @@ def test_a_search_begins_anew_where_the_declared_model_fits_better_without_the_b
     found = hypotheses.search(declared, nowhere, lambda text: None)
     assert [(one.names, one.log_evidence) for one in found] == [((), 400.0), (("tethering",), 450.0)]
     assert begun == [10.0, 400.0, 450.0]
+
+
+def test_what_is_left_out_at_a_size_of_0_leaves_a_hypothesis_as_likely(light, monkeypatch):
+    """Its fit begins where the effect's ended, here without any steps, and with fits without attachments beside it."""
+    last = light[0].final
+    fitted, one = last.fitted, last.added[-1]
+    frames = list(last.fits.assumed.equations)
+    monkeypatch.setattr(fitting, "gauss_newton", lambda begun, **_: begun)
+    with jax.enable_x64(True), one_thread():
+        at_0 = linearise_at(fitted.problem, fitted.named, moved(fitted, one.at, np.zeros(len(one.at))), frames)
+        empty = start(fitted.problem, at_0.point.theta, 0 * at_0.point.s, at_0.point.states, frames)
+        worse = linearise_at(fitted.problem, np.zeros(0, dtype=int), empty, frames)
+        nothing = replace(last.path[0], fits=Fits(worse, worse))
+        again = left_out(replace(last, fits=Fits(worse, at_0), before=nothing), one, lambda text: None)
+    assert worse.log_posterior < at_0.log_posterior - 1
+    assert again.fitted.log_posterior > at_0.log_posterior - SCALES_ERROR
