@@ -137,6 +137,7 @@ def test_a_frame_without_a_force_has_no_weight_among_others():
     assert frame_pulls([None, unknown]) == [None, None]
 
 
+@pytest.mark.slow
 def test_stiffnesses_twice_as_large_as_declared_are_found_by_the_force():
     """Twice the stiffness and the weight of everything moves nothing, and doubles the force."""
     closed, found, _ = closed_over(with_forces(observed(1.0, repeats=2), 2.0))
