@@ -20,7 +20,7 @@ from .gauss_newton import MAX_STIFFNESS, Fitted, start
 from .held_out import HeldOut, held_out, predict_held_out
 from .held_out_force import held_out_force_rms
 from .hypotheses import Hypothesis, hypothesis_of, leave_one_out, of_all_frames, search, searched_frames
-from .problem import Point, Problem
+from .problem import Problem
 from .remainder import FittedRemainder, remainder_of_fit
 from .scores import parameters_sd
 from .starts import ObservedStates
@@ -63,6 +63,12 @@ class Closed:
     problem: Problem
     """What was fitted to."""
 
+    @property
+    def fitted_to_all(self) -> list[Hypothesis]:
+        """Return the hypotheses that were fitted to all frames, the likeliest first."""
+        frames = self.declared.fitted.weights.keys()
+        return [one for one, _ in self.hypotheses if one.fitted.weights.keys() == frames]
+
 
 def close_the_loop(
     dataset: Dataset, *, library: tuple[Effect, ...] = LIBRARY, log: Callable[[str], None] = lambda _: None
@@ -86,7 +92,8 @@ def close_the_loop(
     frames = problem.frames(used)
     few = searched_frames(problem, frames)
     log(f"fitting {len(few)} of {len(frames)} frames in {len(used)} parts with the declared model")
-    observed, begun = filter_estimate(problem, dataset, few)
+    observed = filter_states(problem, dataset, few)
+    begun = start(problem, observed.point.theta, observed.point.s, observed.point.states, few)
     fits = fit(problem, np.zeros(0, dtype=int), [begun, *observed.starts(np.zeros(0, dtype=int))], few, log=log)
     check_finite(fits.likeliest)
     found = of_all_frames(search(hypothesis_of(fits), observed, log), frames, log)
@@ -159,16 +166,12 @@ def _verdict(decision: EvidenceVerdict, last: Hypothesis, dropped: dict[str, str
     return "effect-with-remainder" if last.added else "unexplained"
 
 
-def filter_estimate(problem: Problem, dataset: Dataset, frames: list[int]) -> tuple[ObservedStates, Point]:
-    """Return the filter's states, and the equilibria with its stiffnesses."""
+def filter_states(problem: Problem, dataset: Dataset, frames: list[int]) -> ObservedStates:
+    """Return the filter's states and stiffnesses, with the normal equations of some frames there."""
     detection = dataset.detection
     b = jnp.asarray(np.where(detection.attached, detection.stiffness / dataset.stiffness_factor, 0.0))
     s = np.minimum(np.asarray(problem.prior.bounded(b)), MAX_STIFFNESS)
-    states = np.array([timed.state for timed in dataset.frames])
-    return (
-        ObservedStates.around(problem, s, states, frames),
-        start(problem, np.zeros(problem.sheet.size), s, states, frames),
-    )
+    return ObservedStates.around(problem, s, np.array([timed.state for timed in dataset.frames]), frames)
 
 
 def check_finite(fitted: Fitted) -> None:

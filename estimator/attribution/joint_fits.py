@@ -1,26 +1,23 @@
 """Fits that begin where a closed loop ended: sets of effects that others found, and all but their parameters again."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from ..effects import Effect
-from .close_loop import filter_estimate
+from .close_loop import filter_states
 from .dataset import Dataset
 from .evidence import log_model_evidence
 from .fit import fit
 from .gauss_newton import gauss_newton, linearise_at, moved, start
 from .held_out import predict_held_out
-from .hypotheses import HOPELESS
+from .hypotheses import HOPELESS, Log
 from .joint_hypotheses import Effects, Sited
 from .kept_fits import KeptFit, KeptLoop, places
 from .problem import Problem
 from .scores import parameters_sd
-
-Log = Callable[[str], None]
-"""Receiver of progress messages."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +56,7 @@ def fit_sets(
     """
     problem, (used, _) = Problem.build(dataset, library), dataset.parts
     frames = problem.frames(used)
-    observed, _ = filter_estimate(problem, dataset, frames)
+    observed = filter_states(problem, dataset, frames)
     found, known = list[KeptFit](), {one.effects: one for one in kept.fits}
     likeliest = max(kept.fits, key=lambda one: one.recorded.log_posterior(kept.prior))
     for shared in sorted(wanted, key=len):
