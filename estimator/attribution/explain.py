@@ -28,8 +28,7 @@ def explanation(closed: Closed) -> list[dict[str, Any]]:
         parameters_nat. The sum of particles_nat and shared_nat is that of the frames.
     """
     declared = closed.declared
-    of_all = [one for one, _ in closed.hypotheses if one.fitted.weights.keys() == declared.fitted.weights.keys()]
-    ranked = [one for one in of_all if one.added and np.isfinite(one.log_evidence)][:N_EXPLAINED]
+    ranked = [one for one in closed.fitted_to_all if one.added and np.isfinite(one.log_evidence)][:N_EXPLAINED]
     splits = parallel_map(lambda k: likelihood_split([declared, *ranked][k].fitted), range(len(ranked) + 1))
     return [_explained(one, declared, splits[k], splits[0]) for k, one in enumerate(ranked, 1)]
 

@@ -7,7 +7,8 @@ import numpy as np
 from .close_loop import Closed
 from .dataset import Dataset
 from .gauss_newton import Fitted
-from .held_out_force import measured_forces, predicted_forces, rms_force
+from .held_out import rms
+from .held_out_force import measured_forces, predicted_forces
 from .normal_equations import without_stiffnesses
 
 MAX_LOG_SD = 0.35
@@ -40,7 +41,7 @@ def force_report(closed: Closed, dataset: Dataset) -> dict[str, Any] | None:
         "stiffness_factor_log_sd": own_sd,
         "membrane_stiffness_n_per_m": dataset.estimator.declaration.membrane_stiffness
         * float(np.exp(_log_factor(last, ("force_scale", "stretch", "heterogeneity")))),
-        "held_out_rms_n": {name: rms_force(one[spare]) if spare else None for name, one in errors.items()},
+        "held_out_rms_n": {name: rms(one[spare]) if spare else None for name, one in errors.items()},
         "frames": [
             {
                 "index": dataset.frames[k].index,

@@ -129,7 +129,7 @@ def residuals(problem: Problem, point: Point, frames: list[int]) -> Float[np.nda
 
 
 def rms(residual: Float[np.ndarray, "m 3"]) -> float:
-    """Return the root mean square length of residuals [m]."""
+    """Return the root mean square length of residuals, in their unit."""
     return float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
 
 

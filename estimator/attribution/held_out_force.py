@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .gauss_newton import Fitted
-from .held_out import from_rest
+from .held_out import from_rest, rms
 from .tool_pull import predicted_pull
 
 
@@ -31,9 +31,4 @@ def measured_forces(fitted: Fitted, frames: list[int]) -> Float[np.ndarray, "t 3
 def held_out_force_rms(fitted: Fitted, part: int) -> float | None:
     """Return the root mean square error of the force in a part that was not fitted to [N]; None where none is known."""
     frames = [k for k in fitted.problem.frames({part}) if fitted.problem.with_force([k])]
-    return rms_force(measured_forces(fitted, frames) - predicted_forces(fitted, frames)) if frames else None
-
-
-def rms_force(forces: Float[np.ndarray, "t 3"]) -> float:
-    """Return the root mean square length of forces, or of differences of forces [N]."""
-    return float(np.sqrt(np.mean(np.sum(forces**2, axis=1))))
+    return rms(measured_forces(fitted, frames) - predicted_forces(fitted, frames)) if frames else None

@@ -18,15 +18,10 @@ from .gauss_newton import Fitted, linearise_at, moved
 from .problem import Problem
 from .scores import MIN_SCORE, Score, scores
 from .starts import ObservedStates, stepped
-from .verdict import HypothesisEvidence, log_posterior
+from .verdict import MAX_EFFECTS, REACH, HypothesisEvidence, log_posterior
 
-MAX_EFFECTS = 3
-"""Largest number of effects of a hypothesis."""
 BEAM = 3
 """Hypotheses of each size that are searched on from."""
-REACH = 3.0
-"""Difference of log posterior from the best up to which hypotheses are searched on from [nat]: a twentieth of its
-probability, less than what the credible set leaves out."""
 HOPELESS = 200.0
 """Difference of the log posterior of fits from which one is not fitted to its end [nat]: its share is too small."""
 N_FITTED = 4
@@ -139,9 +134,9 @@ def search(declared: Hypothesis, observed: ObservedStates, log: Log) -> list[Hyp
         for one in (one for one in beam if posterior(one) > best - REACH):
             for score in likely(one, log):
                 new += fitted(one, score)
-        if new and posterior(first := max(new, key=posterior)) > best and first.before is not None:
+        if new and posterior(first := max(new, key=posterior)) > best:
             for score in confused(first):
-                new += fitted(first.before, score)
+                new += fitted(first.path[-2], score)
         beam = sorted(new, key=posterior, reverse=True)[:BEAM]
         if not beam or posterior(beam[0]) < best:
             break
@@ -165,9 +160,8 @@ def search(declared: Hypothesis, observed: ObservedStates, log: Log) -> list[Hyp
 
 def confused(one: Hypothesis) -> list[Score]:
     """Return the positive scores of the effects that the last one of a hypothesis is often confused with."""
-    assert one.before is not None
     names = one.added[-1].effect.confounded_with
-    return [score for score in one.before.scores if score.name in names and score.log_bayes_factor > 0]
+    return [score for score in one.path[-2].scores if score.name in names and score.log_bayes_factor > 0]
 
 
 def with_declared(found: list[Hypothesis], again: Hypothesis) -> list[Hypothesis]:

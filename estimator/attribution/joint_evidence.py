@@ -21,8 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import lsq_linear
 
-NEAR_BOUND = 1e-9
-"""Distance from its lower bound up to which a parameter is at it [prior standard deviations]."""
+from .evidence import NEAR_BOUND
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,12 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .joint_evidence import OwnInformation, SharedPosterior, SharedPrior, joint_evidence
-from .verdict import POWER, EvidenceVerdict, HypothesisEvidence, decide, log_posterior, log_prior
+from .verdict import MAX_EFFECTS, POWER, REACH, EvidenceVerdict, HypothesisEvidence, decide, log_posterior, log_prior
 
-MAX_SHARED = 3
-"""Largest number of effects that recordings share."""
-REACH = 3.0
-"""Difference of log posterior from the best up to which a set is fitted to the recordings that lack it [nat]."""
 Sited = tuple[str, int]
 """An effect's name, and its site."""
 Effects = tuple[Sited, ...]
@@ -142,7 +138,7 @@ def within_reach(
     wanted = list[Effects]()
     for shared in _sets(recordings) | {(one,) for each in scores.values() for one in each}:
         fitted = _fitted(recordings, shared, prior)
-        if len(shared) > MAX_SHARED or len(fitted) == len(recordings):
+        if len(shared) > MAX_EFFECTS or len(fitted) == len(recordings):
             continue
         total = _together(shared, fitted, prior).posterior.log_evidence if fitted else 0.0
         for name in recordings.keys() - fitted.keys():

@@ -13,10 +13,9 @@ from jaxtyping import Float, Int
 from .close_loop import Closed
 from .fit import Fits
 from .gauss_newton import Fitted, linearise_at
-from .joint_evidence import SharedPrior
 from .joint_hypotheses import Effects, EffectsPrior, RecordedFit, Sited
 from .noise_scales import NoiseScales
-from .own_information import own_information
+from .own_information import own_information, shared_prior
 from .problem import Point, Problem
 
 
@@ -98,9 +97,8 @@ class KeptLoop:
     @classmethod
     def of(cls, closed: Closed) -> "KeptLoop":
         """Return what is kept of a closed loop: hypotheses of finite evidence that were fitted to all frames."""
-        problem, frames = closed.problem, closed.declared.fitted.weights.keys()
-        of_all = [one for one, _ in closed.hypotheses if one.fitted.weights.keys() == frames]
-        every = [one for one in of_all if not one.added or np.isfinite(one.log_evidence)]
+        problem = closed.problem
+        every = [one for one in closed.fitted_to_all if not one.added or np.isfinite(one.log_evidence)]
         effects = [tuple((added.effect.name, added.score.site) for added in one.added) for one in every]
         return cls(
             rest=np.asarray(problem.history.rest),
@@ -127,9 +125,5 @@ def effects_prior(problem: Problem) -> EffectsPrior:
     tissue = {one.name for one in library if not one.sensing}
     return EffectsPrior(
         sites={one.name: one.sites for one in library},
-        of_tissue={
-            sited: SharedPrior(sd=problem.prior_sd[at], lower=problem.lower_bounds(at))
-            for sited, at in every.items()
-            if sited[0] in tissue
-        },
+        of_tissue={sited: shared_prior(problem, at) for sited, at in every.items() if sited[0] in tissue},
     )

@@ -1,9 +1,8 @@
 """Sizes of the errors that no effect stands for, which are free in every hypothesis, and their prior.
 
 Force errors of the model, smooth force fields, the tool's reports and its measured force each have a variance, over the
-assumed one. Its
-logarithm is normal where only what is assumed is wrong, or, with the same probability, larger by any amount: then the
-model lacks something that has no name here.
+assumed one. Its logarithm is normal where only what is assumed is wrong, or, with the same probability, larger by any
+amount: then the model lacks something that has no name here.
 """
 
 from dataclasses import dataclass, fields

@@ -46,24 +46,14 @@ def _check(effect: Effect, plain: SheetModel, context: FrameContext, x: jax.Arra
             "change parts by equinox.tree_at, and numbers by jax.numpy."
         )
 
-    def outputs(theta: jax.Array) -> jax.Array:
-        model = effect.acts(plain, theta, context)
-        parts = (model.energy.internal_gradient(x), look(model, x), model.tool, model.energy.rest, model.force_factor)
-        return jnp.concatenate([part.ravel() for part in parts])
+    def parts(model: SheetModel) -> jax.Array:
+        several = (model.energy.internal_gradient(x), look(model, x), model.tool, model.energy.rest, model.force_factor)
+        return jnp.concatenate([part.ravel() for part in several])
 
-    without = jnp.concatenate(
-        [
-            part.ravel()
-            for part in (
-                plain.energy.internal_gradient(x),
-                look(plain, x),
-                plain.tool,
-                context.rest,
-                plain.force_factor,
-            )
-        ]
-    )
-    if not np.allclose(outputs(zero), without, rtol=0, atol=ROUNDING):
+    def outputs(theta: jax.Array) -> jax.Array:
+        return parts(effect.acts(plain, theta, context))
+
+    if not np.allclose(outputs(zero), parts(plain), rtol=0, atol=ROUNDING):
         raise ValueError(f"Effect {effect.name} must change nothing where all its parameters are 0.")
     derivative = np.asarray(jax.jacfwd(outputs)(zero))
     if not np.isfinite(derivative).all():

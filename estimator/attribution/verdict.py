@@ -15,6 +15,11 @@ from scipy.special import logsumexp
 POWER = 0.2
 """Power of the evidence. Of 0.1 to 1 it has the least expected calibration error on 32 recordings of two layouts; see
 docs/STUDIES.md for that on three others."""
+MAX_EFFECTS = 3
+"""Largest number of effects of a hypothesis."""
+REACH = 3.0
+"""Difference of log posterior from the best up to which hypotheses are fitted and searched on from [nat]: a twentieth
+of its probability, less than what the credible set leaves out."""
 CREDIBLE = 0.95
 """Probability from which effects are certain, and that rivals have together with the best."""
 

@@ -144,10 +144,9 @@ def _times(recording: Recording, library: tuple[Effect, ...], log: Callable[[str
     for seconds, line in clock.phases:
         log(f"    {seconds:7.2f} s until: {' '.join(line.split())}")
     problem, fitted = closed.problem, closed.declared.fitted
-    parts = list(dict.fromkeys(one.part for one in dataset.frames))
     measure("scores", lambda: scores(fitted))
     measure("one_hypothesis", lambda: fit(problem, problem.sheet.place(EFFECT), [fitted.point], list(fitted.equations)))
-    measure("held_out", lambda: predict_held_out(fitted, parts[-1]))
+    measure("held_out", lambda: predict_held_out(fitted, dataset.frames[-1].part))
     measure("remainder", lambda: remainder_of_fit(fitted))
     whole = float(metrics["read_and_filter_s"]["value"]) + float(metrics["close_s"]["value"])
     named = ", ".join(closed.final.names)

@@ -12,7 +12,7 @@ from plotly.subplots import make_subplots
 
 from jiggle_mj.recording.output_files import write_text
 
-from .discrepancy_page import AFTER, BEFORE, TRIVIAL, WITHOUT_MODEL, sizes_with_sd
+from .discrepancy_page import AFTER, BEFORE, TRIVIAL, WITHOUT_MODEL, sizes_with_sd, title_of
 from .joint_section import joint_rows, joint_sentences
 
 ERRORS = {
@@ -112,7 +112,7 @@ def _better_trivial(held_out: Mapping[str, Any]) -> str | None:
 def _likeliest(posterior: Sequence[Mapping[str, Any]]) -> str:
     """Return the likeliest hypotheses with their probabilities, in words."""
     shown = [one for one in posterior[:SHOWN_HYPOTHESES] if one["probability"] >= MIN_PROBABILITY]
-    return ", ".join(f"{' and '.join(one['effects']) or 'nothing'} {one['probability']:.2f}" for one in shown)
+    return ", ".join(f"{title_of(one)} {one['probability']:.2f}" for one in shown)
 
 
 def _error_cells(row: Mapping[str, Any]) -> list[str]:

@@ -87,13 +87,14 @@ def story(found: Mapping[str, Any]) -> list[str]:
 
 def _posterior_sentence(posterior: list[Mapping[str, Any]]) -> str:
     """Return the probabilities of the likeliest hypotheses, and whether their errors are larger than usual."""
-    shares = [f"{_title(one)} {one['probability']:.2g}" for one in posterior[:LISTED]]
+    shares = [f"{title_of(one)} {one['probability']:.2g}" for one in posterior[:LISTED]]
     larger = posterior[0]["larger_errors"]
     why = f" Its errors are larger than usual with a probability of {larger:.2g}: something without a name is missing."
     return f"Probability of what is missing: {', '.join(shares)}.{why if larger > 0.5 else ''}"
 
 
-def _title(hypothesis: Mapping[str, Any]) -> str:
+def title_of(hypothesis: Mapping[str, Any]) -> str:
+    """Return the names of a hypothesis's effects as text."""
     return " and ".join(hypothesis["effects"]) or "nothing"
 
 
@@ -245,7 +246,7 @@ def _pictures(sheet: Sheet, found: Mapping[str, Any]) -> go.Figure:
         figure.add_trace(dots, row=1, col=column)
         figure.update_yaxes(scaleanchor=f"x{'' if column == 1 else column}", row=1, col=column)
     likely = found["posterior"][:SHOWN_HYPOTHESES][::-1]
-    bars = go.Bar(x=[one["probability"] for one in likely], y=[_title(one) for one in likely],
+    bars = go.Bar(x=[one["probability"] for one in likely], y=[title_of(one) for one in likely],
                   orientation="h", marker={"color": AFTER}, showlegend=False)  # fmt: skip
     figure.add_trace(bars, row=2, col=1)
     for when, key, colour in zip(TIMES, LOCALISED, (BEFORE, AFTER), strict=True):

@@ -6,7 +6,7 @@
    recording is predicted worse than with what is declared is not taken.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jiggle_mj.estimator.attribution.hypotheses import Log
 from jiggle_mj.estimator.attribution.joint_fits import FixedFit, title
 from jiggle_mj.estimator.attribution.joint_hypotheses import (
     Effects,
@@ -34,9 +35,6 @@ from .closing_order import ClosingOrder
 from .joint_orders import FitSets, FixSizes, Order, execute
 from .kept_files import FITS, read_fits
 from .same_sheet import refuse_other_shapes
-
-Log = Callable[[str], None]
-"""Receiver of progress messages."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ Each follows the recording again, with the settings with which the loop was clos
 Its lines go to the end of the recording's log.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from jiggle_mj.estimator.attribution.dataset import Dataset, collect_dataset
+from jiggle_mj.estimator.attribution.hypotheses import Log
 from jiggle_mj.estimator.attribution.joint_fits import FixedFit, fit_sets, with_fixed
 from jiggle_mj.estimator.attribution.joint_hypotheses import Effects, Sited
 from jiggle_mj.estimator.attribution.kept_fits import KeptFit
@@ -20,9 +21,6 @@ from jiggle_mj.estimator.blas import one_thread
 from .closing_order import LOG, ClosingOrder
 from .compiled_functions import drop_many_compiled
 from .kept_files import FITS, read_fits
-
-Log = Callable[[str], None]
-"""Receiver of progress messages."""
 
 
 @dataclass(frozen=True, kw_only=True)
