@@ -60,13 +60,13 @@ def fit(
         named: parameters of the effects in the model.
         starts: points that the fit may begin at; it begins at the likeliest.
         frames: frames to fit to.
-        before: fits without some of the parameters, which are starts too.
+        before: fits without some of the parameters to the same frames, which are starts too.
         worth: log posterior [nat]; a fit that cannot reach it, as far as its normal equations tell, ends early.
         log: receives progress messages.
     """
     problem = problem.with_scales(problem.assumed_scales)
-    starts = starts if before is None else [*starts, before.assumed.point]
     begun = [weigh(problem, point, frames) for point in starts]
+    begun += [] if before is None else [before.assumed]
     likelihoods = np.nan_to_num([one.log_likelihood for one in begun], nan=-np.inf)
     assumed = gauss_newton(linearised_fit(begun[int(np.argmax(likelihoods))], named), log=log)
     likeliest = _with_scales(assumed, None if before is None else before.likeliest.problem.scales, worth, log)
