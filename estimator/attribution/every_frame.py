@@ -33,7 +33,7 @@ def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Fram
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameLikelihood:
         return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise)
 
-    return _each(problem, point, frames, one)
+    return each_frame(problem, point, frames, one)
 
 
 def linearised(
@@ -45,7 +45,7 @@ def linearised(
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> NormalEquations:
         return normal_equations(problem.sheet, weights[k], theta, along_, frame, context)
 
-    return _each(problem, point, weights, one)
+    return each_frame(problem, point, weights, one)
 
 
 def misfit_under(problem: Problem, weights: dict[int, FrameLikelihood], point: Point) -> float:
@@ -73,7 +73,7 @@ def residual(problem: Problem, weights: dict[int, FrameLikelihood], point: Point
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> WeightedResiduals:
         return misfit(problem.sheet, weights[k], theta, s, frame, context, x)
 
-    return _each(problem, point, weights, one)
+    return each_frame(problem, point, weights, one)
 
 
 def misfit_of(problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals]) -> float:
@@ -93,7 +93,7 @@ def misfit_of(problem: Problem, weights: dict[int, FrameLikelihood], every: dict
     return float(total)
 
 
-def _each(
+def each_frame(
     problem: Problem,
     point: Point,
     frames: Iterable[int],

@@ -27,6 +27,7 @@ from .gauss_newton import (
 from .likeliest_scales import likeliest_scales
 from .noise_scales import NoiseScales
 from .problem import Point, Problem
+from .refinement import refined
 
 MAX_SCALES = 2
 """Largest number of times that the sizes of the errors are estimated."""
@@ -75,6 +76,7 @@ def fit(
         if promised_log_posterior(begun_there) > max(worth, likeliest.log_posterior):
             other = _with_scales(gauss_newton(begun_there, log=log), None, worth, log)
             likeliest = max(likeliest, other, key=lambda one: one.log_posterior)
+    likeliest = _refined(likeliest, worth, log)
     return Fits(assumed=assumed, likeliest=likeliest)
 
 
@@ -85,7 +87,15 @@ def fit_to_more(fits: Fits, frames: list[int]) -> Fits:
     likeliest = _with_scales(
         gauss_newton(linearise_at(last.problem, last.named, begun, frames)), None, -np.inf, lambda _: None
     )
-    return fits._replace(likeliest=likeliest)
+    return fits._replace(likeliest=_refined(likeliest, -np.inf, lambda _: None))
+
+
+def _refined(now: Fitted, worth: float, log: Callable[[str], None]) -> Fitted:
+    """Return a fit with errors of the likeliest size after refining steps, with their size estimated again."""
+    if not promised_log_posterior(now) > worth:
+        return now
+    better = refined(now, log=log)
+    return now if better is now else _with_scales(better, None, worth, log)
 
 
 def _with_scales(now: Fitted, near: NoiseScales | None, worth: float, log: Callable[[str], None]) -> Fitted:

@@ -28,7 +28,7 @@ from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
 from ..filters.frame import Frame
 from ..filters.smooth_noise import each
-from ..physics.block_tridiagonal import add_to_diagonal, assemble, cholesky, log_det
+from ..physics.block_tridiagonal import BlockCholesky, add_to_diagonal, assemble, cholesky, log_det
 from ..physics.membrane import TriangleMembrane
 from .grasped_frames import ClosedFrame
 from .sheet import PredictedSheet, mean_of_held
@@ -86,7 +86,7 @@ class FrameLikelihood(eqx.Module):
 
         It is ln |N + H F F^T H^T| - 2 ln |H|. Rows without a force equation are those of inputs, and do not count.
         """
-        return self.force_log_determinant() - self._log_det_of_square()
+        return self.force_log_determinant() - log_det(self.square_factor())
 
     @eqx.filter_jit
     def force_log_determinant(self) -> Float[Array, ""]:
@@ -96,14 +96,14 @@ class FrameLikelihood(eqx.Module):
         smooth = 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
         return log_det(self.frame.factor) - log_weights + smooth
 
-    def _log_det_of_square(self) -> Float[Array, ""]:
-        """Return ln |H^T H| over the particles with a force equation."""
+    def square_factor(self) -> BlockCholesky:
+        """Return the factor of H^T H over the particles with a force equation, with an identity for the others."""
         balance, known = self.balance, self.frame.weight > 0
         both = known[:, None] & jnp.append(known, False)[balance.neighbours]
         rows = jnp.where(both[:, :, None, None], self.frame.dr_dx, 0.0)
         square = assemble(balance.layout, [(balance.places, jnp.einsum("npij,nqik->npjqk", rows, rows))])
         inputs = jnp.where(known[:, None, None], 0.0, jnp.eye(3)[None])
-        return log_det(cholesky(add_to_diagonal(balance.layout, square, inputs)))
+        return cholesky(add_to_diagonal(balance.layout, square, inputs))
 
 
 def frame_likelihood(
@@ -120,14 +120,14 @@ def frame_likelihood(
     It is two programs, like `normal_equations`: as one, XLA lays the factor out so that a solve takes 1.5 times as
     long.
     """
-    likelihood = _likelihood(*_around(sheet, theta, s, frame, context, x), frame, noise)
+    likelihood = _likelihood(*around(sheet, theta, s, frame, context, x), frame, noise)
     if frame.pull is None:
         return likelihood
     return replace(likelihood, adjoint=_pull_adjoint(sheet, likelihood, theta, frame, context))
 
 
 @eqx.filter_jit
-def _around(
+def around(
     sheet: PredictedSheet,
     theta: Float[Array, " p"],
     s: Float[Array, " n"],
@@ -153,8 +153,7 @@ def _likelihood(
     frame: ClosedFrame,
     noise: Float[Array, "n modes"],
 ) -> FrameLikelihood:
-    smooth = noise[:, None, :, None] * jnp.eye(3)[None, :, None, :]
-    smooth = each(partial(balance.apply, linear.dr_dx), seen_shift(frame, smooth.reshape(len(noise), 3, -1)))
+    smooth = each(partial(balance.apply, linear.dr_dx), seen_noise(frame, noise))
     white = each(partial(balance.whitened, linear), smooth)
     likelihood = FrameLikelihood(
         balance=balance,
@@ -180,6 +179,12 @@ def _pull_adjoint(
     balance, linear = likelihood.balance, likelihood.frame
     model = sheet.model(theta, context, frame.displacement)
     return adjoint(balance, linear, pull_slope(balance, model, frame, linear.s, linear.x))
+
+
+def seen_noise(frame: ClosedFrame, noise: Float[Array, "n modes"]) -> Float[Array, "n 3 k"]:
+    """Return the observed shift F of each field of the smooth noise in each direction [m]."""
+    smooth = noise[:, None, :, None] * jnp.eye(3)[None, :, None, :]
+    return seen_shift(frame, smooth.reshape(len(noise), 3, -1))
 
 
 def seen_shift(frame: ClosedFrame, shift: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:

@@ -183,23 +183,25 @@ def better_point(now: Fitted, steps: list[Step]) -> Weighed | None:
     """Return a point of lower cost; None if none is found.
 
     Whole steps are tried first, those of the largest predicted gain, then shorter ones along the first of them. The
-    posterior may have stiffnesses that fit worse; a step of the parameters alone then has the larger gain. Last comes
-    one of the effects' parameters alone, because a small step of a nuisance parameter, such as the bending stiffness,
-    may change the determinants by more than all else gains.
+    posterior may have stiffnesses that fit worse; a step of the parameters alone then has the larger gain.
     """
     gains = _whole_gains(now, steps)
     whole = [steps[k] for k in np.argsort(-np.array(gains), kind="stable") if gains[k] > MIN_GAIN]
     tries = [(step, 1.0) for step in whole[:MAX_WHOLE]]
     tries += [(step, share) for step in whole[:1] for share in SHORTER_SHARES]
-    alone = effects_step(now)
-    tries += [(alone, share) for share in (1.0, *SHORTER_SHARES)] if _whole_gains(now, [alone])[0] > MIN_GAIN else []
     for step, share in tries:
-        theta, s = _apply(now, step, share)
-        point = start(now.problem, theta, s, now.point.states, list(now.equations))
-        there = weigh(now.problem, point, list(now.equations))
-        if _cost(now.problem, now.named, point, there.log_likelihood) < now.cost - MIN_GAIN:
+        there, cost = after_step(now, step, share)
+        if cost < now.cost - MIN_GAIN:
             return there
     return None
+
+
+def after_step(now: Fitted, step: Step, share: float) -> tuple[Weighed, float]:
+    """Return the point after a share of a step, and its cost [nat, doubled]."""
+    theta, s = applied(now, step, share)
+    frames = list(now.equations)
+    there = weigh(now.problem, start(now.problem, theta, s, now.point.states, frames), frames)
+    return there, _cost(now.problem, now.named, there.point, there.log_likelihood)
 
 
 def promised_log_posterior(now: Fitted) -> float:
@@ -209,10 +211,10 @@ def promised_log_posterior(now: Fitted) -> float:
 
 def _whole_gains(now: Fitted, steps: list[Step]) -> list[float]:
     """Return by how much the cost falls in each whole step, by the normal equations [nat, doubled]."""
-    return [_predicted_gain(now, *_apply(now, step, 1.0)) for step in steps]
+    return [_predicted_gain(now, *applied(now, step, 1.0)) for step in steps]
 
 
-def _apply(now: Fitted, step: Step, share: float) -> Step:
+def applied(now: Fitted, step: Step, share: float) -> Step:
     """Return the parameters and s after a share of a step, within their bounds."""
     free, sd = now.free, now.problem.sd(now.named)
     largest = np.where(np.arange(len(free)) < len(now.named), MAX_EFFECT, MAX_NUISANCE) * sd
@@ -246,17 +248,6 @@ def candidate_steps(now: Fitted, *, likeliest_set: bool = True) -> list[Step]:
 def parameter_step(now: Fitted) -> Step:
     """Return the step of the parameters alone."""
     return _towards(now, now.point.s)
-
-
-def effects_step(now: Fitted) -> Step:
-    """Return the step of the effects' parameters alone, with s and the nuisance parameters as they are."""
-    n, d, point, sd = len(now.point.s), len(now.named), now.point, now.problem.sd(now.named)
-    joint = GaussianInformation.from_normal_equations(now.square, s=n, named=d, nuisance=len(sd) - d)
-    joint = joint.with_independent("named", sd[:d] ** -2, -point.theta[now.named] / sd[:d] ** 2)
-    theta = np.zeros(len(point.theta))
-    best = joint.condition(s=np.zeros(n), nuisance=np.zeros(len(sd) - d)).mean() if d else np.zeros(0)
-    theta[now.named] = np.clip(best, -MAX_CHANGE * sd[:d], MAX_CHANGE * sd[:d])
-    return theta, np.zeros(n)
 
 
 def common_factor_step(now: Fitted) -> Step:

@@ -78,8 +78,8 @@ def predicted_pull(
     return model.force_factor * jnp.sum(jnp.where(frame.held[:, None], forces, 0.0), axis=0)
 
 
-def adjoint(balance: ForceBalance, linear: Frame, dP_dx: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
-    """Return lambda at a linearised state; dP_dx has the components of P last."""
+def adjoint(balance: ForceBalance, linear: Frame, dP_dx: Float[Array, "n 3 c"]) -> Float[Array, "n 3 c"]:
+    """Return lambda at a linearised state; dP_dx has the components of P, or of anything else, last."""
     itself = balance.neighbours == jnp.arange(len(linear.x))[:, None]
     springs = jnp.where(itself, grip_stiffness(balance, linear)[:, None], 0.0)
     rows = linear.dr_dx + springs[:, :, None, None] * jnp.eye(3)[None, None]

@@ -148,7 +148,9 @@ class FrameContext(eqx.Module):
 
     def memory_weights(self, rate: Float[Array, ""]) -> Float[Array, " frames"]:
         """Return the weight of each past state in a memory that follows the state at a rate [1/s], from rest on."""
-        until, since = (jnp.where(at <= self.time, jnp.exp(-rate * (self.time - at)), 0.0) for at in self._spans())
+        ages = (self.time - jnp.minimum(at, self.time) for at in self._spans())  # finite, for reverse derivatives
+        past = (at <= self.time for at in self._spans())
+        until, since = (jnp.where(is_past, jnp.exp(-rate * age), 0.0) for is_past, age in zip(past, ages, strict=True))
         return until - since
 
     def lag_share(self, constant: Float[Array, ""]) -> Float[Array, ""]:

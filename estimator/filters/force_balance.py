@@ -159,7 +159,9 @@ class ForceBalance(eqx.Module):
         """
         flow = jnp.zeros(len(x), x.dtype)
         for term in self.energy.terms:
-            flow = flow.at[term.vertices].add(jnp.sqrt(jnp.sum(term.gradient(x[term.vertices]) ** 2, axis=-1)))
+            squared = jnp.sum(term.gradient(x[term.vertices]) ** 2, axis=-1)
+            root = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)  # with a derivative at 0
+            flow = flow.at[term.vertices].add(root)
         return self.force_sd * jnp.sqrt(self.config.force_sd_floor**2 + (flow / self.force_level) ** 2)
 
     @eqx.filter_jit
@@ -267,8 +269,7 @@ class ForceBalance(eqx.Module):
     def information(self, frame: Frame, fit: Fit) -> FrameInformation:
         """Return the frame's evidence about s, with its state eliminated."""
         D, whitened = self.calibrated(frame, fit), frame.weight[:, None] * fit.force_residual
-        score = -jnp.sum(D * whitened, axis=1)
-        chi2 = jnp.sum(fit.residual * whitened)
+        score, chi2 = -jnp.sum(D * whitened, axis=1), jnp.sum(fit.residual * whitened)
         return FrameInformation(precision=self.precision_along(frame, D), score=score, chi2=chi2, at=frame.s)
 
     def precision_along(self, frame: Frame, D: Float[Array, "n 3"]) -> Float[Array, "n n"]:

@@ -53,42 +53,6 @@ def test_all_stiffnesses_and_parameters_step_together_to_where_both_fit_best(lig
     np.testing.assert_allclose(theta[fitted.free] / sd, bounded, rtol=SOLVE_RTOL, atol=1e-8)
 
 
-def test_effects_alone_step_to_where_they_fit_best_beside_all_else_as_it_is(light):
-    """Against least squares over the effects' parameters, with their prior as rows."""
-    fitted = light[0].final.fitted
-    point, n, d = fitted.point, len(fitted.point.s), len(fitted.named)
-    sd = fitted.problem.sd(fitted.named)[:d]
-    values, vectors = np.linalg.eigh(fitted.square)
-    rows = (np.sqrt(np.maximum(values, 0)) * vectors).T
-    residual = np.concatenate([rows[:, -1], point.theta[fitted.named] / sd])
-    best = -np.linalg.lstsq(np.r_[rows[:, n : n + d], np.diag(1 / sd)], residual, rcond=None)[0]
-    theta, s = stepping.effects_step(fitted)
-    assert d and not s.any() and not np.delete(theta, fitted.named).any()
-    bounded = np.clip(best / sd, -stepping.MAX_CHANGE, stepping.MAX_CHANGE)
-    np.testing.assert_allclose(theta[fitted.named] / sd, bounded, rtol=SOLVE_RTOL, atol=1e-8)
-
-
-def test_effects_are_tried_alone_where_all_other_steps_fail(light, monkeypatch):
-    """From an effect that is taken out again, with every point refused that moves anything else."""
-    ended = light[0].final.fitted
-    problem, frames = ended.problem, list(ended.equations)
-    real, others = stepping.weighed_with, np.setdiff1d(ended.free, ended.named)
-
-    def refusing(problem, point, weights):
-        there = real(problem, point, weights)
-        same = np.array_equal(point.theta[others], ended.point.theta[others])
-        return there if same else dataclasses.replace(there, log_likelihood=-np.inf)
-
-    with jax.enable_x64(True), one_thread():
-        begun = stepping.linearise_at(
-            problem, ended.named, moved(ended, ended.named, np.zeros(len(ended.named))), frames
-        )
-        monkeypatch.setattr(stepping, "weighed_with", refusing)
-        better = stepping.better_point(begun, stepping.candidate_steps(begun))
-    assert better is not None and np.linalg.norm(better.point.theta[ended.named]) > 0
-    np.testing.assert_array_equal(better.point.s, ended.point.s)
-
-
 def test_a_common_factor_of_all_stiffnesses_is_a_candidate_only_where_none_is_likelier_attached(light):
     """With errors a million times as large nothing is known of the attachments."""
     fitted = light[0].declared.fitted
