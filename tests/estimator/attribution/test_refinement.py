@@ -24,7 +24,9 @@ RTOL, ATOL = 0.1, 0.05
 """Error of the slope by the logarithm of s."""
 
 
-@pytest.mark.parametrize("shared", [False, True], ids=["white noise", "noise that neighbours share"])
+@pytest.mark.parametrize(
+    "shared", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["white noise", "noise that neighbours share"]
+)
 def test_the_slope_is_that_of_finite_differences(light, shared):
     """The differences are of states that are predicted anew, so that weights and determinants change with them."""
     fitted = light[0].final.fitted
