@@ -80,6 +80,7 @@ def test_two_effects_at_once_are_both_named_with_their_indistinguishable_ones():
     assert scale["theta"][0] == pytest.approx(np.log(1.1), abs=SCALE_ERROR)
 
 
+@pytest.mark.slow
 def test_a_hold_that_slips_is_not_explained_by_larger_forces():
     """From the second increment of each lift on, the jaws are a centimetre further than what they hold."""
     slipped = [report_further(one, 0.01) if _is_late(one) else one for one in observed(1.0)]

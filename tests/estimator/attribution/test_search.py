@@ -146,6 +146,7 @@ def test_a_search_begins_anew_where_the_declared_model_fits_better_without_the_b
     assert begun == [10.0, 400.0, 450.0]
 
 
+@pytest.mark.slow
 def test_what_is_left_out_at_a_size_of_0_leaves_a_hypothesis_as_likely(light, monkeypatch):
     """Its fit begins where the effect's ended, here without any steps, and with fits without attachments beside it."""
     last = light[0].final
