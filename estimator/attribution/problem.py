@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..belief.attachment_belief import AttachmentBelief
 from ..belief.prior import prior_belief
@@ -61,6 +61,8 @@ class Problem:
     """Nuisance parameters, which are free in all fits."""
     own_sd: Float[np.ndarray, " own"]
     """Prior standard deviations of the nuisance parameters."""
+    force_sd: Float[Array, ""]
+    """Assumed tau of the force errors where forces of `force_level` meet; see `ForceBalance` [N]."""
     scales: NoiseScales = field(default_factory=NoiseScales)
     """Sizes of the errors."""
 
@@ -104,13 +106,14 @@ class Problem:
             prior_sd=np.concatenate([np.ravel(effect.prior_sds) for effect in library]),
             own=np.concatenate([[], *(sheet.place(name) for name in own)]).astype(int),
             own_sd=np.concatenate([[], *(np.asarray(sd) for sd in own.values())]),
+            force_sd=balance.force_sd,
             scales=NoiseScales(pull=1.0 if forced else None),
         )
 
     def with_scales(self, scales: NoiseScales) -> "Problem":
         """Return the problem with other sizes of the errors."""
-        balance = self.sheet.balance.inflated(scales.force / self.scales.force)
-        return replace(self, sheet=eqx.tree_at(lambda one: one.balance, self.sheet, balance), scales=scales)
+        sd = self.force_sd * scales.force**0.5
+        return replace(self, sheet=eqx.tree_at(lambda one: one.balance.force_sd, self.sheet, sd), scales=scales)
 
     def frames(self, parts: Iterable[int]) -> list[int]:
         """Return the frames of some parts."""

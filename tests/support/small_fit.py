@@ -34,14 +34,16 @@ def small_problem() -> Problem:
     )
     reports = ((0.0, np.zeros(3)),)
     timed = Timed(frame=frame, index=0, grasp=1, part=0, time=0.0, closed=0.0, state=rest, reports=reports)
+    balance = sheet_balance(1e-4)
     return Problem(
-        sheet=PredictedSheet(balance=sheet_balance(1e-4), view=centred(sheet()), library=LIBRARY),
+        sheet=PredictedSheet(balance=balance, view=centred(sheet()), library=LIBRARY),
         history=FrameHistory([timed], rest),
         prior=sheet_prior(),
         noise=np.zeros((n, 0)),
         prior_sd=np.concatenate([np.ravel(effect.prior_sds) for effect in LIBRARY]),
         own=np.zeros(0, dtype=int),
         own_sd=np.zeros(0),
+        force_sd=balance.force_sd,
     )
 
 
