@@ -81,16 +81,27 @@ def misfit_of(problem: Problem, weights: dict[int, FrameLikelihood], every: dict
     total = 0.0
     for frames in problem.by_part(weights).values():
         tool = np.array([np.asarray(every[k].tool)[:, None] for k in frames])
-        fields = np.sum([np.asarray(every[k].fields) for k in frames], axis=0)
-        among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
+        precision, fields = field_information(problem, weights, every, frames)
         total += sum(float(every[k].squared) for k in frames)
         total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0] / problem.scales.tool
         if problem.scales.pull is not None and problem.with_force(frames):
             pulls = np.array([np.asarray(every[k].pull)[:, None] for k in frames])
             closed = [problem.history.frames[k].frame for k in frames]
             total += pull_products(pulls, closed)[0, 0] / problem.scales.pull
-        total -= fields @ np.linalg.solve(among + np.eye(N_FIELDS) / problem.amplitude**2, fields)
+        total -= fields @ np.linalg.solve(precision, fields)
     return float(total)
+
+
+def field_information(
+    problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals], frames: list[int]
+) -> tuple[Float[np.ndarray, "q q"], Float[np.ndarray, " q"]]:
+    """Return the precision of the amplitudes c of a grasp's smooth force fields, and their products with the residuals.
+
+    The likeliest c are minus the products, over the precision.
+    """
+    among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
+    products = np.sum([np.asarray(every[k].fields) for k in frames], axis=0)
+    return among + np.eye(N_FIELDS) / problem.amplitude**2, products
 
 
 def each_frame(

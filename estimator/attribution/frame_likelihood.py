@@ -96,11 +96,15 @@ class FrameLikelihood(eqx.Module):
         smooth = 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
         return log_det(self.frame.factor) - log_weights + smooth
 
+    def inner(self, rows: Float[Array, "n p 3 3"]) -> Float[Array, "n p 3 3"]:
+        """Return rows of H with nothing but what couples particles with a force equation."""
+        known = self.frame.weight > 0
+        both = known[:, None] & jnp.append(known, False)[self.balance.neighbours]
+        return jnp.where(both[:, :, None, None], rows, 0.0)
+
     def square_factor(self) -> BlockCholesky:
         """Return the factor of H^T H over the particles with a force equation, with an identity for the others."""
-        balance, known = self.balance, self.frame.weight > 0
-        both = known[:, None] & jnp.append(known, False)[balance.neighbours]
-        rows = jnp.where(both[:, :, None, None], self.frame.dr_dx, 0.0)
+        balance, known, rows = self.balance, self.frame.weight > 0, self.inner(self.frame.dr_dx)
         square = assemble(balance.layout, [(balance.places, jnp.einsum("npij,nqik->npjqk", rows, rows))])
         inputs = jnp.where(known[:, None, None], 0.0, jnp.eye(3)[None])
         return cholesky(add_to_diagonal(balance.layout, square, inputs))

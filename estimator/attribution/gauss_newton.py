@@ -130,12 +130,24 @@ def gauss_newton(
         passes: largest number of Gauss-Newton steps.
         log: receives progress messages.
     """
+    return improved(begun, lambda now: better_point(now, candidate_steps(now)), passes=passes, step="step", log=log)
+
+
+def improved(
+    begun: Fitted,
+    better: Callable[[Fitted], Weighed | None],
+    *,
+    passes: int,
+    step: str,
+    log: Callable[[str], None],
+) -> Fitted:
+    """Return the fit after steps to better points, at most `passes`, until there is none; `step` is their name."""
     now = begun
     for count in range(passes):
-        if (better := better_point(now, candidate_steps(now))) is None:
+        if (there := better(now)) is None:
             break
-        before, now = now, linearised_fit(better, now.named)
-        log(f"step {count + 1}: {before.cost / 2:.1f} -> {now.cost / 2:.1f} nat")
+        before, now = now, linearised_fit(there, now.named)
+        log(f"{step} {count + 1}: {before.cost / 2:.1f} -> {now.cost / 2:.1f} nat")
     return now
 
 

@@ -19,7 +19,6 @@ the predicted state x, which itself depends on theta. As r = 0 for it, springs t
 the normal equations.
 """
 
-from collections.abc import Mapping
 from functools import partial
 
 import equinox as eqx
@@ -31,12 +30,12 @@ from jaxtyping import Array, Float
 from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
 from ..physics.block_tridiagonal import BlockTridiagonal, inverse_band, window_sums
-from .every_frame import each_frame, residual
+from .every_frame import each_frame, field_information, residual
 from .frame_likelihood import N_FIELDS, FrameLikelihood, around, seen_noise
 from .grasped_frames import ClosedFrame
 from .linear import WeightedResiduals
 from .problem import Point, Problem
-from .sheet import PredictedSheet, closed_on, held_displacement
+from .sheet import PredictedSheet, gripped_forces
 from .tool_pull import adjoint
 
 
@@ -70,18 +69,19 @@ def likelihood_slopes(
     theta, noise = jnp.asarray(point.theta), jnp.asarray(problem.noise)
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
-        of_s, of_theta = frame_slope(problem.sheet, weights[k], theta, frame, context, x, noise, amplitudes[k])
+        e = every[k].forces
+        of_s, of_theta = frame_slope(problem.sheet, weights[k], theta, frame, context, x, e, noise, amplitudes[k])
         return np.asarray(of_s), np.asarray(of_theta)
 
     return each_frame(problem, point, weights, one)
 
 
 def _amplitudes(
-    problem: Problem, frames: list[int], weights: Mapping[int, FrameLikelihood], every: Mapping[int, WeightedResiduals]
+    problem: Problem, frames: list[int], weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals]
 ) -> FieldAmplitudes:
-    among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
-    covariance = np.linalg.inv(among + np.eye(N_FIELDS) / problem.amplitude**2)
-    mean = -covariance @ np.sum([np.asarray(every[k].fields) for k in frames], axis=0)
+    precision, products = field_information(problem, weights, every, frames)
+    covariance = np.linalg.inv(precision)
+    mean = -covariance @ products
     return FieldAmplitudes(mean=jnp.asarray(mean), root=jnp.asarray(np.linalg.cholesky(covariance)))
 
 
@@ -115,9 +115,7 @@ def _errors(
     a = a.at[:, 1 + N_FIELDS :].add(jax.scipy.linalg.solve_triangular(likelihood.spread.T, jnp.eye(m)))
     seen = smooth @ a
     forces = forces + each(partial(balance.apply, frame.dr_dx), seen)
-    explained = each(
-        lambda v: balance.solved(frame, balance.transposed(frame.dr_dx, frame.weight[:, None] * v)), forces
-    )
+    explained = each(partial(balance.explained, frame), forces)
     return _Errors(positions=seen - explained, amplitudes=c, position_covariance=inverse_band(frame.factor))
 
 
@@ -129,16 +127,15 @@ def frame_slope(
     frame: ClosedFrame,
     context: FrameContext,
     x: Float[Array, "n 3"],
+    e: Float[Array, "n 3"],
     noise: Float[Array, "n modes"],
     fields: FieldAmplitudes,
 ) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
     """Return one frame's slope of -ln likelihood by s and theta at its predicted state x [nat].
 
-    `noise` are the smooth noise's fields [m].
+    `e` are the forces H (y - h(x)) + r there [N], `noise` the smooth noise's fields [m].
     """
     s, known = likelihood.frame.s, likelihood.frame.weight > 0
-    model = sheet.model(theta, context, frame.displacement)
-    e = likelihood.forces(frame.y - look(model, x)) + likelihood.frame.unbalanced
     errors = _errors(likelihood, seen_noise(frame, noise), e, fields)
     of_square = inverse_band(likelihood.square_factor())
 
@@ -151,18 +148,10 @@ def frame_slope(
         squared = jnp.sum(f**2, axis=(1, 2))
         squared = squared + window_sums(balance.layout, errors.position_covariance, balance.places, linear.dr_dx)
         weight = jnp.where(known, linear.weight, 1.0)
-        inside = jnp.append(known, False)[balance.neighbours][:, :, None, None]
-        rows = jnp.where(inside, linear.dr_dx, 0.0)
-        log_square = window_sums(balance.layout, of_square, balance.places, rows)
+        log_square = window_sums(balance.layout, of_square, balance.places, likelihood.inner(linear.dr_dx))
         return 0.5 * jnp.sum(jnp.where(known, weight * squared - 3 * jnp.log(weight) - log_square, 0.0))
-
-    def forces(theta: Float[Array, " p"], s: Float[Array, " n"]) -> Float[Array, "n 3"]:
-        model, closed = sheet.model(theta, context, frame.displacement), closed_on(sheet, theta, frame, context)
-        grip = closed + held_displacement(model, frame, closed, x)[None]
-        springs = jnp.where(frame.held, (1 - s) * likelihood.balance.grip_stiffness, 0.0)
-        return sheet.balance.with_energy(model.energy).unbalanced(x, s) + springs[:, None] * (x - grip)
 
     along_theta, along_s, along_x = jax.grad(expected, argnums=(0, 1, 2))(theta, s, x)
     balance_slope = adjoint(likelihood.balance, likelihood.frame, along_x[:, :, None])[:, :, 0]
-    of_theta, of_s = jax.vjp(forces, theta, s)[1](balance_slope)
+    of_theta, of_s = jax.vjp(lambda *at: gripped_forces(sheet, *at, frame, context, x), theta, s)[1](balance_slope)
     return along_s - of_s, along_theta - of_theta

@@ -27,8 +27,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..parallel_map import parallel_map
-from .every_frame import residual
-from .frame_likelihood import N_FIELDS, FrameLikelihood
+from .every_frame import field_information, residual
+from .frame_likelihood import FrameLikelihood
 from .gauss_newton import Weighed
 from .normal_equations import offset_share
 from .tool_pull import pull_products
@@ -58,9 +58,8 @@ def likelihood_split(fit: Weighed) -> LikelihoodSplit:
     every, variance = residual(problem, weights, fit.point), problem.scales.tool
     fields, tool, grasps = dict[int, np.ndarray](), dict[int, float](), 0.0
     for frames in problem.by_part(weights).values():
-        among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
-        along = np.sum([np.asarray(every[k].fields) for k in frames], axis=0)
-        c = -np.linalg.solve(among + np.eye(N_FIELDS) / problem.amplitude**2, along)
+        precision, products = field_information(problem, weights, every, frames)
+        c = -np.linalg.solve(precision, products)
         reports = np.array([np.asarray(every[k].tool) for k in frames])
         ratio, share = offset_share(problem.history.frames[frames[0]].frame, len(frames))
         offset = share * reports.sum(axis=0)
@@ -73,7 +72,7 @@ def likelihood_split(fit: Weighed) -> LikelihoodSplit:
                 tool[k] -= 0.5 * float(own @ own / problem.scales.pull + constant)
             whole = pull_products(pulls, [problem.history.frames[k].frame for k in frames])[0, 0]
             grasps -= 0.5 * float(whole - np.sum(pulls**2)) / problem.scales.pull
-        log_det = np.linalg.slogdet(np.eye(N_FIELDS) + problem.amplitude**2 * among)[1]
+        log_det = np.linalg.slogdet(problem.amplitude**2 * precision)[1]
         grasps -= 0.5 * float(c @ c / problem.amplitude**2 + log_det + offset @ offset / (ratio * variance))
 
     def one(k: int) -> tuple[Float[np.ndarray, " n"], float]:

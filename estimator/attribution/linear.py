@@ -19,8 +19,8 @@ from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
 from .frame_likelihood import N_FIELDS, FrameLikelihood, seen_shift
 from .grasped_frames import ClosedFrame
-from .sheet import PredictedSheet, closed_on, held_displacement, tool_residual
-from .tool_pull import grip_stiffness, off_balance, predicted_pull
+from .sheet import PredictedSheet, gripped_forces, tool_residual
+from .tool_pull import off_balance, predicted_pull
 
 TOOL_SD = 2.5e-4
 """Standard deviation of the mean of the held particles about the tool, from frame to frame [m]."""
@@ -167,11 +167,8 @@ def _pull_rows(
 
     def along(u):
         to = theta + directions @ u
-        changed, closed = sheet.model(to, context, frame.displacement), closed_on(sheet, to, frame, context)
-        grip = closed + held_displacement(changed, frame, closed, x)[None]
-        unbalanced = sheet.balance.with_energy(changed.energy).unbalanced(x, s)
-        unbalanced = unbalanced - grip_stiffness(balance, linear)[:, None] * grip
-        return unbalanced, predicted_pull(sheet.balance, changed, frame, s, x)
+        pull = predicted_pull(sheet.balance, sheet.model(to, context, frame.displacement), frame, s, x)
+        return gripped_forces(sheet, to, s, frame, context, x), pull
 
     dforce, dpull = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
     dtheta = dpull - jnp.einsum("nic,nid->cd", adjoint, dforce)

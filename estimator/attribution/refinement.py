@@ -8,16 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .gauss_newton import (
-    MAX_CHANGE,
-    MIN_GAIN,
-    Fitted,
-    Step,
-    Weighed,
-    after_step,
-    applied,
-    linearised_fit,
-)
+from .gauss_newton import MAX_CHANGE, MIN_GAIN, Fitted, Step, Weighed, after_step, applied, improved
 from .likelihood_slope import likelihood_slopes
 from .normal_equations import whole_slope
 
@@ -35,13 +26,7 @@ SHARES = (0.1, 0.5)
 
 def refined(begun: Fitted, *, log: Callable[[str], None] = lambda _: None) -> Fitted:
     """Return the fit after refining steps, with the noise scales that it has."""
-    now = begun
-    for count in range(MAX_REFINEMENTS):
-        if (better := refined_point(now)) is None:
-            break
-        before, now = now, linearised_fit(better, now.named)
-        log(f"refinement {count + 1}: {before.cost / 2:.1f} -> {now.cost / 2:.1f} nat")
-    return now
+    return improved(begun, refined_point, passes=MAX_REFINEMENTS, step="refinement", log=log)
 
 
 def refined_point(now: Fitted) -> Weighed | None:

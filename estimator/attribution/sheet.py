@@ -105,6 +105,24 @@ def held_displacement(
     return jnp.where(jnp.any(frame.held & frame.visible), displacement, model.tool)
 
 
+def gripped_forces(
+    sheet: PredictedSheet,
+    theta: Float[Array, " p"],
+    s: Float[Array, " n"],
+    frame: ClosedFrame,
+    context: FrameContext,
+    x: Float[Array, "n 3"],
+) -> Float[Array, "n 3"]:
+    """Return the forces r at x, those of the springs to where the grip is observed included [N].
+
+    At a predicted state they are 0, so that their derivatives say how it changes.
+    """
+    model, closed = sheet.model(theta, context, frame.displacement), closed_on(sheet, theta, frame, context)
+    grip = closed + held_displacement(model, frame, closed, x)[None]
+    springs = jnp.where(frame.held, (1 - s) * sheet.balance.grip_stiffness, 0.0)
+    return sheet.balance.with_energy(model.energy).unbalanced(x, s) + springs[:, None] * (x - grip)
+
+
 def mean_of_held(frame: ClosedFrame, values: Float[Array, "n ..."]) -> Float[Array, "..."]:
     """Return the mean over the held particles that are observed; zero if there are none."""
     both = frame.held & frame.visible

@@ -148,9 +148,10 @@ class FrameContext(eqx.Module):
 
     def memory_weights(self, rate: Float[Array, ""]) -> Float[Array, " frames"]:
         """Return the weight of each past state in a memory that follows the state at a rate [1/s], from rest on."""
-        ages = (self.time - jnp.minimum(at, self.time) for at in self._spans())  # finite, for reverse derivatives
-        past = (at <= self.time for at in self._spans())
-        until, since = (jnp.where(is_past, jnp.exp(-rate * age), 0.0) for is_past, age in zip(past, ages, strict=True))
+        # ages are finite in both branches: a reverse derivative has both
+        until, since = (
+            jnp.where(at <= self.time, jnp.exp(-rate * jnp.maximum(self.time - at, 0.0)), 0.0) for at in self._spans()
+        )
         return until - since
 
     def lag_share(self, constant: Float[Array, ""]) -> Float[Array, ""]:

@@ -37,6 +37,7 @@ from ..physics.block_tridiagonal import (
     window_sums,
 )
 from ..physics.energy import SheetEnergy
+from ..physics.environment import lengths
 from ..physics.mesh import SheetMesh, neighbour_table, pattern, reverse_places
 from .config import FilterConfig
 from .evidence import Evidence
@@ -159,9 +160,7 @@ class ForceBalance(eqx.Module):
         """
         flow = jnp.zeros(len(x), x.dtype)
         for term in self.energy.terms:
-            squared = jnp.sum(term.gradient(x[term.vertices]) ** 2, axis=-1)
-            root = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)  # with a derivative at 0
-            flow = flow.at[term.vertices].add(root)
+            flow = flow.at[term.vertices].add(lengths(term.gradient(x[term.vertices])))
         return self.force_sd * jnp.sqrt(self.config.force_sd_floor**2 + (flow / self.force_level) ** 2)
 
     @eqx.filter_jit
@@ -205,8 +204,7 @@ class ForceBalance(eqx.Module):
             _, _, decreasing, count = state
             return decreasing & (count < config.max_state_steps)
 
-        # a frame of the right shapes, which the first step replaces
-        shapes = jax.eval_shape(lambda: self.linearise(x, s, single))
+        shapes = jax.eval_shape(lambda: self.linearise(x, s, single))  # of the frame that the first step replaces
         empty = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), shapes)
         frame, _, decreasing, _ = jax.lax.while_loop(unfinished, step, (empty, x, jnp.asarray(True), jnp.asarray(0)))
         if evidence.fields is not None:
@@ -257,8 +255,7 @@ class ForceBalance(eqx.Module):
     def fit(self, frame: Frame) -> Fit:
         """Return the state that explains a frame best, for the s of its linearisation."""
         residual = frame.unbalanced + self.apply(frame.dr_dx, frame.innovation)
-        pushed = self.transposed(frame.dr_dx, frame.weight[:, None] * residual)
-        position_residual = self.solved(frame, pushed)
+        position_residual = self.explained(frame, residual)
         return Fit(
             residual=residual,
             force_residual=residual - self.apply(frame.dr_dx, position_residual),
@@ -269,7 +266,8 @@ class ForceBalance(eqx.Module):
     def information(self, frame: Frame, fit: Fit) -> FrameInformation:
         """Return the frame's evidence about s, with its state eliminated."""
         D, whitened = self.calibrated(frame, fit), frame.weight[:, None] * fit.force_residual
-        score, chi2 = -jnp.sum(D * whitened, axis=1), jnp.sum(fit.residual * whitened)
+        score = -jnp.sum(D * whitened, axis=1)
+        chi2 = jnp.sum(fit.residual * whitened)
         return FrameInformation(precision=self.precision_along(frame, D), score=score, chi2=chi2, at=frame.s)
 
     def precision_along(self, frame: Frame, D: Float[Array, "n 3"]) -> Float[Array, "n n"]:
@@ -292,8 +290,11 @@ class ForceBalance(eqx.Module):
 
     def whitened(self, frame: Frame, v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Return N^-1 v."""
-        pushed = self.transposed(frame.dr_dx, frame.weight[:, None] * v)
-        return frame.weight[:, None] * (v - self.apply(frame.dr_dx, self.solved(frame, pushed)))
+        return frame.weight[:, None] * (v - self.apply(frame.dr_dx, self.explained(frame, v)))
+
+    def explained(self, frame: Frame, v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """Return A^-1 H^T W v, the change of the state that explains forces v best [m]."""
+        return self.solved(frame, self.transposed(frame.dr_dx, frame.weight[:, None] * v))
 
     def residuals(self, frame: Frame, fit: Fit) -> ForceResiduals:
         """Return the whitened residuals of the frame's fit, with their degrees of freedom."""
@@ -329,8 +330,7 @@ class ForceBalance(eqx.Module):
         error = window_sums(self.layout, fit.covariance, self.places, frame.dD_dx)
         if frame.smooth is not None:
             error = error + frame.smooth.spread_of(partial(self.apply, frame.dD_dx))
-        squared = jnp.sum(frame.dr_ds**2, axis=1)
-        share = self.config.error_weight * error / jnp.maximum(squared, MIN_SQUARE)
+        share = self.config.error_weight * error / jnp.maximum(jnp.sum(frame.dr_ds**2, axis=1), MIN_SQUARE)
         return jnp.maximum(1 - share, 0.0)[:, None] * frame.dr_ds
 
     def _weight(self, error: Float[Array, " n"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, " n"]:
@@ -357,9 +357,9 @@ class ForceBalance(eqx.Module):
                 seen = seen + frame.smooth.added_cost(innovation)
             return 0.5 * (seen + jnp.sum(weight * force))
 
-        lengths = jnp.array(STEP_LENGTHS, move.dtype)
-        costs = jax.vmap(cost)(lengths)
-        return frame.x + lengths[jnp.nanargmin(costs)] * move, costs
+        shares = jnp.array(STEP_LENGTHS, move.dtype)
+        costs = jax.vmap(cost)(shares)
+        return frame.x + shares[jnp.nanargmin(costs)] * move, costs
 
     def _internal_dr_dx(self, x: Float[Array, "n 3"]) -> Float[Array, "n p 3 3"]:
         """Return df/dx, the windows of each particle's row beside one another [N/m]."""

@@ -158,9 +158,9 @@ class Grip(Term):
         return (self.stiffness[:, None, None] * window)[:, None, :, None, :]
 
 
-def lengths(d: Float[Array, "m 3"]) -> Float[Array, " m"]:
-    """Return |d| [m], with a finite derivative at d = 0."""
-    squared = jnp.sum(d**2, axis=1)
+def lengths(d: Float[Array, "*m 3"]) -> Float[Array, "*m"]:
+    """Return |d|, with a finite derivative at d = 0."""
+    squared = jnp.sum(d**2, axis=-1)
     return jnp.sqrt(jnp.where(squared > 0, squared, jnp.finfo(d.dtype).tiny))
 
 

@@ -69,7 +69,7 @@ def test_the_slope_is_that_of_finite_differences(light, shared):
     assert not np.allclose(at.square[chosen, -1] * s[chosen], of_s, rtol=RTOL, atol=ATOL)
 
 
-def test_a_refined_fit_is_likelier_and_ends_where_no_step_promises_more(light):
+def test_a_refined_fit_is_likelier_and_returns_to_the_size_it_had(light):
     """From the effect at half of its size, with everything else as it was."""
     fitted = light[0].final.fitted
     with jax.enable_x64(True), one_thread():
