@@ -61,6 +61,8 @@ class FrameLikelihood(eqx.Module):
     """Smooth force fields, whitened: N^-1 Q."""
     among: Float[Array, "q q"]
     """Inner products of the fields: Q^T (N + H F F^T H^T)^-1 Q."""
+    log_square: Float[Array, ""]
+    """ln |H^T H| over the particles with a force equation."""
     adjoint: Float[Array, "n 3 3"] | None = None
     """By how much the tool's force falls with a force on each particle [1]; None where no frame has a measured one."""
 
@@ -80,21 +82,21 @@ class FrameLikelihood(eqx.Module):
         """Return the forces H (y - h(x)) of a residual of positions y - h(x) [m]."""
         return self.balance.apply(self.frame.dr_dx, self.seen[:, None] * residual)
 
+    @property
+    def force_share(self) -> Float[Array, " n"]:
+        """Return the share that the force error of the model has in the variance of each force."""
+        return ((1 - self.frame.s) * self.frame.error) ** 2 * self.frame.weight
+
     @eqx.filter_jit
     def log_determinant(self) -> Float[Array, ""]:
         """Return ln |C| of the observed positions' covariance C, up to the precision of their white noise.
 
         It is ln |N + H F F^T H^T| - 2 ln |H|. Rows without a force equation are those of inputs, and do not count.
         """
-        return self.force_log_determinant() - log_det(self.square_factor())
-
-    @eqx.filter_jit
-    def force_log_determinant(self) -> Float[Array, ""]:
-        """Return ln |N + H F F^T H^T|, up to the same: all that changes with the variances at a given H."""
         w, known = self.frame.weight, self.frame.weight > 0
         log_weights = jnp.sum(jnp.where(known, 3 * jnp.log(jnp.where(known, w, 1.0)), 0.0))
         smooth = 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
-        return log_det(self.frame.factor) - log_weights + smooth
+        return log_det(self.frame.factor) - log_weights + smooth - self.log_square
 
     def inner(self, rows: Float[Array, "n p 3 3"]) -> Float[Array, "n p 3 3"]:
         """Return rows of H with nothing but what couples particles with a force equation."""
@@ -105,9 +107,8 @@ class FrameLikelihood(eqx.Module):
     def square_factor(self) -> BlockCholesky:
         """Return the factor of H^T H over the particles with a force equation, with an identity for the others."""
         balance, known, rows = self.balance, self.frame.weight > 0, self.inner(self.frame.dr_dx)
-        square = assemble(balance.layout, [(balance.places, jnp.einsum("npij,nqik->npjqk", rows, rows))])
         inputs = jnp.where(known[:, None, None], 0.0, jnp.eye(3)[None])
-        return cholesky(add_to_diagonal(balance.layout, square, inputs))
+        return _factor(balance, rows, known.astype(float), inputs)
 
 
 def frame_likelihood(
@@ -125,9 +126,39 @@ def frame_likelihood(
     long.
     """
     likelihood = _likelihood(*around(sheet, theta, s, frame, context, x), frame, noise)
+    likelihood = replace(likelihood, log_square=_log_square(likelihood))
     if frame.pull is None:
         return likelihood
     return replace(likelihood, adjoint=_pull_adjoint(sheet, likelihood, theta, frame, context))
+
+
+def with_force_sd(
+    likelihood: FrameLikelihood, force_sd: Float[Array, ""], frame: ClosedFrame, noise: Float[Array, "n modes"]
+) -> FrameLikelihood:
+    """Return a frame's likelihood with another standard deviation of force errors, the field of `ForceBalance` [N]."""
+    found = _likelihood(*_with_force_sd(likelihood, force_sd), frame, noise)
+    return replace(found, log_square=likelihood.log_square, adjoint=likelihood.adjoint)
+
+
+@eqx.filter_jit
+def _with_force_sd(
+    likelihood: FrameLikelihood, force_sd: Float[Array, ""]
+) -> tuple[ForceBalance, Frame, Float[Array, "n 3 q"]]:
+    factor = force_sd / likelihood.balance.force_sd
+    balance, linear = replace(likelihood.balance, force_sd=force_sd), likelihood.frame
+    error = factor * linear.error
+    weight = balance.weight(error, linear.s, linear.evidence)
+    precision = linear.evidence.white_precision + balance.config.position_precision_floor * jnp.eye(3)[None]
+    root = _factor(balance, linear.dr_dx, weight, precision)
+    return balance, replace(linear, error=error, weight=weight, factor=root), factor * likelihood.fields
+
+
+def _factor(
+    balance: ForceBalance, rows: Float[Array, "n p 3 3"], weight: Float[Array, " n"], diagonal: Float[Array, "n 3 3"]
+) -> BlockCholesky:
+    """Return the factor of H^T W H and a diagonal, for the rows of H."""
+    square = assemble(balance.layout, [(balance.places, jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows))])
+    return cholesky(add_to_diagonal(balance.layout, square, diagonal))
 
 
 @eqx.filter_jit
@@ -168,8 +199,14 @@ def _likelihood(
         fields=fields,
         white=each(partial(balance.whitened, linear), fields),
         among=jnp.zeros((N_FIELDS, N_FIELDS)),
+        log_square=jnp.zeros(()),
     )
     return eqx.tree_at(lambda one: one.among, likelihood, likelihood.dot(fields, fields, likelihood.white))
+
+
+@eqx.filter_jit
+def _log_square(likelihood: FrameLikelihood) -> Float[Array, ""]:
+    return log_det(likelihood.square_factor())
 
 
 @eqx.filter_jit

@@ -16,9 +16,10 @@ from ..belief.attachment_belief import AttachmentBelief
 from ..belief.gaussian_information import GaussianInformation
 from ..filters.implicit import likeliest, quick_summary
 from ..filters.posterior_summary import PosteriorSummary
-from .every_frame import directions, linearised, log_determinants, misfit_under, weighed
+from .every_frame import directions, linearised, log_determinants, misfit_of, residual, weighed
 from .frame_likelihood import FrameLikelihood
-from .linear import NormalEquations
+from .linear import NormalEquations, WeightedResiduals
+from .noise_scales import NoiseScales
 from .normal_equations import reduced
 from .problem import Point, Problem
 from .sheet import predict_all
@@ -55,6 +56,8 @@ class Weighed:
     """Parameters and states."""
     weights: dict[int, FrameLikelihood]
     """Weights of the residuals of each frame."""
+    residuals: dict[int, WeightedResiduals]
+    """Residuals of each frame."""
     log_likelihood: float
     """Log density of the observations, determinants included [nat], up to a constant of the frames."""
 
@@ -76,14 +79,13 @@ class Fitted(Weighed):
 
     @property
     def cost(self) -> float:
-        """Return twice the negative logarithm of likelihood and prior [nat]."""
-        return _cost(self.problem, self.named, self.point, self.log_likelihood)
+        """Return twice the negative logarithm of likelihood and prior, of the noise scales too [nat]."""
+        return cost(self, self.named)
 
     @property
     def log_posterior(self) -> float:
-        """Return the logarithm of likelihood and prior, of the noise scales too [nat]; -inf where it is no number."""
-        found = self.problem.scales.log_prior() - self.cost / 2
-        return found if np.isfinite(found) else -np.inf
+        """Return the logarithm of likelihood and prior [nat]; -inf where it is no number."""
+        return -self.cost / 2 if np.isfinite(self.cost) else -np.inf
 
     @property
     def belief(self) -> AttachmentBelief:
@@ -158,8 +160,15 @@ def weigh(problem: Problem, point: Point, frames: list[int]) -> Weighed:
 
 def weighed_with(problem: Problem, point: Point, weights: dict[int, FrameLikelihood]) -> Weighed:
     """Return a point with the weights that it has."""
-    doubled = misfit_under(problem, weights, point) + log_determinants(problem, weights)
-    return Weighed(problem=problem, point=point, weights=weights, log_likelihood=-0.5 * doubled)
+    return evaluated(problem, point, weights, residual(problem, weights, point))
+
+
+def evaluated(
+    problem: Problem, point: Point, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
+) -> Weighed:
+    """Return a weighed point with its likelihood under a problem's scales of the fields and of the tool."""
+    doubled = misfit_of(problem, weights, residuals) + log_determinants(problem, weights)
+    return Weighed(problem=problem, point=point, weights=weights, residuals=residuals, log_likelihood=-0.5 * doubled)
 
 
 def linearise_at(problem: Problem, named: np.ndarray, point: Point, frames: list[int]) -> Fitted:
@@ -186,6 +195,7 @@ def fit_at(at: Weighed, named: np.ndarray, equations: dict[int, NormalEquations]
         square=square,
         equations=equations,
         weights=at.weights,
+        residuals=at.residuals,
         summary=posterior(problem, square, point, free, sd),
         log_likelihood=at.log_likelihood,
     )
@@ -202,18 +212,17 @@ def better_point(now: Fitted, steps: list[Step]) -> Weighed | None:
     tries = [(step, 1.0) for step in whole[:MAX_WHOLE]]
     tries += [(step, share) for step in whole[:1] for share in SHORTER_SHARES]
     for step, share in tries:
-        there, cost = after_step(now, step, share)
-        if cost < now.cost - MIN_GAIN:
+        there = after_step(now, step, share)
+        if cost(there, now.named) < now.cost - MIN_GAIN:
             return there
     return None
 
 
-def after_step(now: Fitted, step: Step, share: float) -> tuple[Weighed, float]:
-    """Return the point after a share of a step, and its cost [nat, doubled]."""
+def after_step(now: Fitted, step: Step, share: float, scales: NoiseScales | None = None) -> Weighed:
+    """Return the point after a share of a step, with other noise scales if any are given."""
     theta, s = applied(now, step, share)
-    frames = list(now.equations)
-    there = weigh(now.problem, start(now.problem, theta, s, now.point.states, frames), frames)
-    return there, _cost(now.problem, now.named, there.point, there.log_likelihood)
+    problem, frames = now.problem if scales is None else now.problem.with_scales(scales), list(now.equations)
+    return weigh(problem, start(problem, theta, s, now.point.states, frames), frames)
 
 
 def promised_log_posterior(now: Fitted) -> float:
@@ -304,9 +313,11 @@ def joint_information(square: np.ndarray, point: Point, free: np.ndarray, sd: np
     return joint.with_independent("theta", sd**-2, -point.theta[free] / sd**2)
 
 
-def _cost(problem: Problem, named: np.ndarray, point: Point, log_likelihood: float) -> float:
-    """Return twice the negative logarithm of likelihood and prior [nat]."""
-    return _prior(point.theta, point.s, problem.free(named), problem.sd(named)) - 2 * log_likelihood
+def cost(at: Weighed, named: np.ndarray) -> float:
+    """Return twice the negative logarithm of likelihood and prior, of the noise scales too [nat]."""
+    problem, point = at.problem, at.point
+    prior = _prior(point.theta, point.s, problem.free(named), problem.sd(named)) - 2 * problem.scales.log_prior()
+    return prior - 2 * at.log_likelihood
 
 
 def _prior(theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"], free: np.ndarray, sd: np.ndarray) -> float:

@@ -28,6 +28,8 @@ N_FITTED = 4
 """Number of effects that are fitted in addition to a hypothesis, the likeliest by their scores."""
 N_SEARCHED = 12
 """Number of frames that the search is over, where there are more: the frames of a pull tell much the same."""
+MAX_SEARCHED = 16
+"""Number of frames up to which it is over all of them, as fits to a few more afterwards would cost more."""
 Log = Callable[[str], None]
 """Receiver of progress messages."""
 
@@ -98,6 +100,8 @@ def hypothesis_of(fits: Fits, added: tuple[AddedEffect, ...] = (), before: Hypot
 
 def searched_frames(problem: Problem, frames: list[int]) -> list[int]:
     """Return the frames that a search is over: spread over each part of them, with the last one of each."""
+    if len(frames) <= MAX_SEARCHED:
+        return frames
     found = list[int]()
     for those in problem.by_part(frames).values():
         count = min(len(those), -(-N_SEARCHED * len(those) // len(frames)))

@@ -1,164 +1,145 @@
-"""The noise scales that are likeliest at a fit: a search over the variance of force errors, with the others profiled.
+"""The noise scales that are likeliest at a fit's point.
 
-A variance of force errors needs new weights of all frames. Those of the smooth fields and of the tool do not: with the
-fields' inner products in their eigenvectors, both likelihoods are sums of a few numbers.
+Those of the smooth fields, of the tool and of its force follow from the residuals that there are. The variance v of
+force errors changes the weights of all frames. At its maximum the likelihood has
+
+    v = sum |f|^2 / degrees,
+
+with f the mean errors in units of the assumed ones, and the number of errors that the frames determine [MacKay 1992,
+doi:10.1162/neco.1992.4.3.415]. Both change with v, so that this is repeated; from the second time on by a secant.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
-from .every_frame import residual, weighed
-from .gauss_newton import Fitted
-from .noise_scales import NoiseScales, log_prior
+from ..parallel_map import parallel_map
+from .every_frame import residual
+from .frame_errors import ForceErrors, force_errors
+from .frame_likelihood import FrameLikelihood, with_force_sd
+from .gauss_newton import Weighed, evaluated
+from .linear import WeightedResiduals
+from .noise_scales import log_prior
 from .normal_equations import pull_sum, tool_sum
-from .problem import AMPLITUDE
+from .problem import AMPLITUDE, Point, Problem
 
-STEP = float(np.log(3.0))
-"""Smallest step outwards in the logarithm of the force variance [nat]."""
-MAX_STEP = 3 * STEP
-"""Largest step outwards [nat]."""
-MAX_BRACKET = 1.5 * STEP
-"""Largest distance of the best place from its neighbours with which the search ends [nat]."""
-MAX_EVALUATIONS = 9
-"""Largest number of variances that the search tries."""
-NEAR = 0.1
-"""Distance from a place that was tried within which the search ends [nat]."""
+SETTLED = 0.25
+"""Gain that is expected of another variance of force errors, up to which it has settled [nat]."""
+MAX_CHANGES = 5
+"""Largest number of times that it is changed."""
+MAX_LOG_CHANGE = 3.0
+"""Largest change of its logarithm at once."""
+MIN_DETERMINED = 1e-3
+"""Lower bound of the share of the force errors that the frames determine, by which steps are divided."""
+PRIOR_STEP = 1e-4
+"""Change of the logarithm of a variance in the difference that is the slope of its prior."""
 LOG_RANGE = (-3.0, 14.0)
 """Range of the logarithms of all variances [nat]. Where a sheet was measured in one plane, or the tool is the mean of
 what it holds, some residuals are 0, and the likelihood would rise towards a variance of 0."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Misfit:
-    """What the likelihood of the fields' variance needs, at one variance of force errors."""
+def with_likeliest_scales(at: Weighed) -> Weighed:
+    """Return a point with the noise scales of largest posterior.
 
-    force: float
-    """The variance of force errors, over the assumed one."""
-    squared: float
-    """Squared residuals without fields, and the log determinants [nat, doubled]."""
-    eigenvalues: Float[np.ndarray, "grasps q"]
-    """Eigenvalues of the fields' inner products, with a variance of 1."""
-    along: Float[np.ndarray, "grasps q"]
-    """Squared inner products of the fields with the residuals, along the eigenvectors."""
-
-    def log_likelihood(self, variance: float) -> float:
-        """Return the log likelihood of a variance of the fields [nat]."""
-        square = AMPLITUDE**2 * variance / self.force
-        gain = np.sum(square * self.along / (1 + square * self.eigenvalues) - np.log1p(square * self.eigenvalues))
-        return 0.5 * float(gain - self.squared)
-
-
-def likeliest_scales(fitted: Fitted, *, near: NoiseScales | None = None) -> NoiseScales:
-    """Return the noise scales of largest posterior at a fit's point.
-
-    Args:
-        fitted: a fit.
-        near: scales that the search begins at too; those of the fit alone if None.
+    Where they would make a frame's matrix singular to rounding, the last ones remain.
     """
-    amplitudes: dict[float, float] = {}
-
-    def log_posterior(log_force: float) -> float:
-        misfit = _misfit(fitted, float(np.exp(log_force)))
-        amplitudes[log_force], value = _largest(misfit.log_likelihood)
-        return value + log_prior(misfit.force)
-
-    own = fitted.problem.scales
-    log_force = maximum(log_posterior, float(np.log(own.force)), float(np.log((near or own).force)))
-    tried = sorted(amplitudes)
-    log_fields = np.interp(log_force, tried, np.log([amplitudes[one] for one in tried]))
-    squared = tool_sum(fitted.problem, fitted.equations)
-    degrees = 3 * len(fitted.equations)
-    tool, _ = _largest(lambda variance: -0.5 * (squared / variance + degrees * np.log(variance)))
-    pull, with_force = own.pull, fitted.problem.with_force(fitted.equations)
-    if with_force:
-        of_pull = pull_sum(fitted.problem, fitted.equations)
-        pull, _ = _largest(lambda variance: -0.5 * (of_pull / variance + 3 * with_force * np.log(variance)))
-    return NoiseScales(force=float(np.exp(log_force)), fields=float(np.exp(log_fields)), tool=tool, pull=pull)
-
-
-def maximum(function: Callable[[float], float], *begun: float) -> float:
-    """Return where a log likelihood has its maximum over the logarithm of a variance, within its range.
-
-    From the places that it begins at, the search goes on outwards until the largest value is between two others. A
-    likelihood falls exponentially below its maximum and linearly above it, as that of Gaussian residuals does. So it
-    then goes to where the function -(a exp(-x) + b x) / 2 through these three places has its maximum. Where the
-    variance is so small that the frames' matrices are singular to rounding, the function is no number; there the range
-    ends.
-    """
-    lowest, highest = LOG_RANGE
-    found: dict[float, float] = {}
-    waiting = [float(np.clip(one, *LOG_RANGE)) for one in begun]
-    following = waiting.pop(0)
-    for _ in range(MAX_EVALUATIONS):
-        value = function(following)
-        if np.isfinite(value):
-            found[following] = value
-        else:
-            lowest = following + max(NEAR, (min(found, default=following + 2 * STEP) - following) / 2)
-        waiting = [one for one in waiting if not _tried(one, found)]
-        if waiting:
-            following = waiting.pop(0)
-            continue
-        following = _following(found, lowest, highest) if found else lowest
-        if _tried(following, found):
+    at, before = with_likeliest_others(at), None
+    for _ in range(MAX_CHANGES):
+        place, errors = float(np.log(at.problem.scales.force)), list(force_errors(at).values())
+        step, slope = likelier_force(at.problem, errors) - place, force_slope(at.problem, errors)
+        least = determined(errors)
+        if not 0.5 * slope * step / least > SETTLED:
             break
-    best = max(found, key=lambda x: found[x], default=begun[0])
-    return following if abs(following - best) < NEAR and min(found) < best < max(found) else best
+        bend = 1.0 if before is None else max((before[1] - step) / (place - before[0]), least)
+        before = (place, step)
+        change = float(np.clip(step / bend, -MAX_LOG_CHANGE, MAX_LOG_CHANGE))
+        there = with_force(at, float(np.clip(place + change, *LOG_RANGE)))
+        if not np.isfinite(there.log_likelihood):
+            break
+        at = there
+    return at
 
 
-def _tried(place: float, found: dict[float, float]) -> bool:
-    """Return whether a place near this one was tried."""
-    return any(abs(place - x) < NEAR for x in found)
+def likelier_force(problem: Problem, errors: Iterable[ForceErrors]) -> float:
+    """Return the logarithm of a likelier variance of force errors, over the assumed one, from what all frames say."""
+    squared, degrees = np.sum([(float(one.squared), float(one.degrees)) for one in errors], axis=0)
+    return float(np.log(_likeliest(squared * problem.scales.force, degrees)))
 
 
-def _following(found: dict[float, float], lowest: float, highest: float) -> float:
-    """Return the place to try next within a range: beyond the best one if it is the first or the last, else between."""
-    places = sorted(found)
-    best = places.index(max(places, key=lambda x: found[x]))
-    if len(places) == 1:
-        return max(places[0] - STEP, lowest) if places[0] > lowest else places[0] + STEP
-    if best == 0 and places[0] > lowest:
-        return max(places[0] - float(np.clip(2 * (places[1] - places[0]), STEP, MAX_STEP)), lowest)
-    if best == len(places) - 1 and places[-1] < highest:
-        return min(places[-1] + float(np.clip(2 * (places[-1] - places[-2]), STEP, MAX_STEP)), highest)
-    if len(places) == 2:
-        return sum(places) / 2
-    middle = min(max(best, 1), len(places) - 2)
-    around = np.array(places[middle - 1 : middle + 2])
-    columns = np.column_stack([np.diff(np.exp(around[1] - around)), np.diff(around)])
-    a, b = np.linalg.solve(columns, -2 * np.diff([found[x] for x in around]))
-    following = float(np.clip(around[1] + np.log(a / b), lowest, highest)) if a > 0 and b > 0 else places[best]
-    below, above = np.diff(around)
-    if not _tried(following, found) or max(below, above) <= MAX_BRACKET:
-        return following
-    return float(around[1] + STEP if above > below else around[1] - STEP)
+def force_slope(problem: Problem, errors: Iterable[ForceErrors]) -> float:
+    """Return the slope of the log posterior by the logarithm of the variance of force errors [nat]."""
+    of_likelihood = 0.5 * sum(float(one.squared - one.degrees) for one in errors)
+    above, below = (log_prior(problem.scales.force * float(np.exp(change))) for change in (PRIOR_STEP, -PRIOR_STEP))
+    return of_likelihood + (above - below) / (2 * PRIOR_STEP)
 
 
-def _largest(log_likelihood: Callable[[float], float]) -> tuple[float, float]:
-    """Return the variance of largest posterior, and the logarithm of the latter [nat]."""
+def determined(errors: Iterable[ForceErrors]) -> float:
+    """Return the share of all force errors that the frames determine.
 
-    def minus(log_variance: float) -> float:
-        return -log_likelihood(float(np.exp(log_variance))) - log_prior(float(np.exp(log_variance)))
+    It is the least curvature of the log likelihood by the logarithm of their variance, over that of as many errors that
+    are known exactly.
+    """
+    degrees, count = np.sum([(float(one.degrees), float(one.count)) for one in errors], axis=0)
+    return max(float(degrees / count), MIN_DETERMINED)
 
-    found = minimize_scalar(minus, bounds=LOG_RANGE, method="bounded")
-    return float(np.exp(found.x)), -float(found.fun)
+
+def with_force(at: Weighed, log_force: float) -> Weighed:
+    """Return a point with a variance of force errors, over the assumed one, and the likeliest other scales."""
+    problem = at.problem.with_scales(replace(at.problem.scales, force=float(np.exp(log_force))))
+    frames, noise = problem.history.frames, jnp.asarray(problem.noise)
+    force_sd = problem.sheet.balance.force_sd
+    weights = parallel_map(lambda k: with_force_sd(at.weights[k], force_sd, frames[k].frame, noise), at.weights)
+    return _with_likeliest_others(problem, at.point, weights, residual(problem, weights, at.point))
 
 
-def _misfit(fitted: Fitted, force: float) -> _Misfit:
-    """Return the residuals of a fit under another variance of force errors."""
-    problem = fitted.problem
-    same = np.isclose(force, problem.scales.force, rtol=1e-12, atol=0)
-    problem = problem.with_scales(replace(problem.scales, force=force))
-    weights = fitted.weights if same else weighed(problem, fitted.point, list(fitted.weights))
-    every = residual(problem, weights, fitted.point)
+def with_likeliest_others(at: Weighed) -> Weighed:
+    """Return a point with the likeliest scales but for the variance of force errors, which it keeps."""
+    return _with_likeliest_others(at.problem, at.point, at.weights, at.residuals)
+
+
+def _with_likeliest_others(
+    problem: Problem, point: Point, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
+) -> Weighed:
+    scales, with_force = problem.scales, problem.with_force(weights)
+    scales = replace(
+        scales,
+        fields=_likeliest_fields(problem, weights, residuals),
+        tool=_likeliest(tool_sum(problem, residuals), 3 * len(weights)),
+        pull=_likeliest(pull_sum(problem, residuals), 3 * with_force) if with_force else scales.pull,
+    )
+    return evaluated(problem.with_scales(scales), point, weights, residuals)
+
+
+def _likeliest_fields(
+    problem: Problem, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
+) -> float:
+    """Return the likeliest variance of the smooth force fields, over the assumed one."""
     eigenvalues, along = [], []
     for frames in problem.by_part(weights).values():
         values, vectors = np.linalg.eigh(np.sum([np.asarray(weights[k].among) for k in frames], axis=0))
         eigenvalues.append(np.maximum(values, 0))
-        along.append((vectors.T @ np.sum([np.asarray(every[k].fields) for k in frames], axis=0)) ** 2)
-    squared = sum(float(every[k].squared) + float(weights[k].force_log_determinant()) for k in weights)
-    return _Misfit(force=force, squared=squared, eigenvalues=np.array(eigenvalues), along=np.array(along))
+        along.append((vectors.T @ np.sum([np.asarray(residuals[k].fields) for k in frames], axis=0)) ** 2)
+
+    def log_likelihood(variance: float) -> float:
+        square = AMPLITUDE**2 * variance / problem.scales.force
+        each = 1 + square * np.array(eigenvalues)
+        return 0.5 * float(np.sum(square * np.array(along) / each - np.log(each)))
+
+    return _largest(log_likelihood)
+
+
+def _likeliest(squared: float, degrees: float) -> float:
+    """Return the likeliest variance of a number of residuals, from their squared sum."""
+    return _largest(lambda variance: -0.5 * (squared / variance + degrees * float(np.log(variance))))
+
+
+def _largest(log_likelihood: Callable[[float], float]) -> float:
+    """Return the variance of largest posterior."""
+
+    def minus(log_variance: float) -> float:
+        return -log_likelihood(float(np.exp(log_variance))) - log_prior(float(np.exp(log_variance)))
+
+    return float(np.exp(minimize_scalar(minus, bounds=LOG_RANGE, method="bounded").x))

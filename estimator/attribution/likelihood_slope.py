@@ -20,6 +20,7 @@ the normal equations.
 """
 
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,94 +30,55 @@ from jaxtyping import Array, Float
 
 from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
-from ..physics.block_tridiagonal import BlockTridiagonal, inverse_band, window_sums
-from .every_frame import each_frame, field_information, residual
-from .frame_likelihood import N_FIELDS, FrameLikelihood, around, seen_noise
+from ..physics.block_tridiagonal import inverse_band, window_sums
+from .every_frame import each_frame
+from .frame_errors import FieldAmplitudes, ForceErrors, field_amplitudes, frame_errors
+from .frame_likelihood import FrameLikelihood, around, seen_noise
+from .gauss_newton import Fitted, Weighed
 from .grasped_frames import ClosedFrame
-from .linear import WeightedResiduals
-from .problem import Point, Problem
+from .normal_equations import less_offset
 from .sheet import PredictedSheet, gripped_forces
-from .tool_pull import adjoint
+from .tool_pull import adjoint, pull_products
 
 
-class FieldAmplitudes(eqx.Module):
-    """What the frames of a grasp say of the amplitudes c of its smooth force fields."""
+class FrameSlope(NamedTuple):
+    """Slope of one frame's -ln likelihood at its predicted state [nat]."""
 
-    mean: Float[Array, " q"]
-    """Mean."""
-    root: Float[Array, "q q"]
-    """Lower Cholesky factor of the covariance."""
+    of_s: Float[Array, " n"]
+    """By the bounded stiffnesses."""
+    of_theta: Float[Array, " p"]
+    """By all parameters of the library."""
+    force_errors: ForceErrors
+    """What it says of the size of the force errors."""
 
 
-def likelihood_slopes(
-    problem: Problem,
-    point: Point,
-    weights: dict[int, FrameLikelihood],
-) -> dict[int, tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]]:
-    """Return the slope of -ln likelihood of each frame's forces by s and by all parameters of the library [nat].
+def likelihood_slopes(at: Weighed) -> dict[int, FrameSlope]:
+    """Return the slope of -ln likelihood of each frame's forces.
 
     The residuals of the tool and of its force are not in it, as their weights do not change.
-
-    Args:
-        problem: what is fitted to.
-        point: parameters and predicted states.
-        weights: weights of the residuals there.
     """
-    every = residual(problem, weights, point)
-    amplitudes = dict[int, FieldAmplitudes]()
-    for frames in problem.by_part(weights).values():
-        amplitudes |= dict.fromkeys(frames, _amplitudes(problem, frames, weights, every))
-    theta, noise = jnp.asarray(point.theta), jnp.asarray(problem.noise)
+    theta, noise, amplitudes = jnp.asarray(at.point.theta), jnp.asarray(at.problem.noise), field_amplitudes(at)
 
-    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
-        e = every[k].forces
-        of_s, of_theta = frame_slope(problem.sheet, weights[k], theta, frame, context, x, e, noise, amplitudes[k])
-        return np.asarray(of_s), np.asarray(of_theta)
+    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameSlope:
+        e = at.residuals[k].forces
+        found = frame_slope(at.problem.sheet, at.weights[k], theta, frame, context, x, e, noise, amplitudes[k])
+        return jax.block_until_ready(found)
 
-    return each_frame(problem, point, weights, one)
+    return each_frame(at.problem, at.point, at.weights, one)
 
 
-def _amplitudes(
-    problem: Problem, frames: list[int], weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals]
-) -> FieldAmplitudes:
-    precision, products = field_information(problem, weights, every, frames)
-    covariance = np.linalg.inv(precision)
-    mean = -covariance @ products
-    return FieldAmplitudes(mean=jnp.asarray(mean), root=jnp.asarray(np.linalg.cholesky(covariance)))
-
-
-class _Errors(eqx.Module):
-    """What a frame's positions say of their errors: of F a - n_y and of c, each with the mean first.
-
-    The other columns are those of a root of the covariance, less the part that n_y has with a and c known.
-    """
-
-    positions: Float[Array, "n 3 k"]
-    """Errors F a - n_y of the positions [m]."""
-    amplitudes: Float[Array, "q k"]
-    """Amplitudes c."""
-    position_covariance: BlockTridiagonal
-    """Covariance of n_y with a and c known [m^2]."""
-
-
-def _errors(
-    likelihood: FrameLikelihood,
-    smooth: Float[Array, "n 3 m"],
-    e: Float[Array, "n 3"],
-    fields: FieldAmplitudes,
-) -> _Errors:
-    """Return what is known of a frame's errors, with the smooth noise's fields F [m] and e = H (y - h(x)) + r [N]."""
-    balance, frame = likelihood.balance, likelihood.frame
-    m = smooth.shape[2]
-    c = jnp.concatenate([fields.mean[:, None], fields.root, jnp.zeros((N_FIELDS, m))], axis=1)
-    forces = likelihood.fields @ c
-    forces = forces.at[:, :, 0].add(e)
-    a = -jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nim,nik->mk", likelihood.noise, forces))
-    a = a.at[:, 1 + N_FIELDS :].add(jax.scipy.linalg.solve_triangular(likelihood.spread.T, jnp.eye(m)))
-    seen = smooth @ a
-    forces = forces + each(partial(balance.apply, frame.dr_dx), seen)
-    explained = each(partial(balance.explained, frame), forces)
-    return _Errors(positions=seen - explained, amplitudes=c, position_covariance=inverse_band(frame.factor))
+def whole_slope(fitted: Fitted, of_frames: dict[int, FrameSlope]) -> Float[np.ndarray, " k"]:
+    """Return the slope of -ln likelihood by s and the free parameters, the tool and its force included [nat]."""
+    problem, equations, n, d = fitted.problem, fitted.equations, len(fitted.point.s), len(fitted.free)
+    total = np.sum([np.append(one.of_s, one.of_theta[fitted.free]) for one in of_frames.values()], axis=0)
+    for frames in problem.by_part(equations).values():
+        closed = [problem.history.frames[k].frame for k in frames]
+        rows = np.array([np.asarray(equations[k].tool) for k in frames])
+        total[n:] += less_offset(rows, closed[0])[:d, -1] / problem.scales.tool
+        if problem.scales.pull is not None and problem.with_force(frames):
+            pulls = np.array([np.asarray(equations[k].pull) for k in frames])
+            total += pull_products(pulls, closed)[: n + d, -1] / problem.scales.pull
+    return total
 
 
 @eqx.filter_jit
@@ -130,28 +92,29 @@ def frame_slope(
     e: Float[Array, "n 3"],
     noise: Float[Array, "n modes"],
     fields: FieldAmplitudes,
-) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
+) -> FrameSlope:
     """Return one frame's slope of -ln likelihood by s and theta at its predicted state x [nat].
 
     `e` are the forces H (y - h(x)) + r there [N], `noise` the smooth noise's fields [m].
     """
     s, known = likelihood.frame.s, likelihood.frame.weight > 0
-    errors = _errors(likelihood, seen_noise(frame, noise), e, fields)
+    errors = frame_errors(likelihood, seen_noise(frame, noise), e, fields)
     of_square = inverse_band(likelihood.square_factor())
 
-    def expected(theta: Float[Array, " p"], s: Float[Array, " n"], x: Float[Array, "n 3"]) -> Float[Array, ""]:
+    def expected(theta: Float[Array, " p"], s: Float[Array, " n"], x: Float[Array, "n 3"]):
         balance, linear, Q = around(sheet, theta, s, frame, context, x)
         model = sheet.model(theta, context, frame.displacement)
         positions = errors.positions.at[:, :, 0].add(likelihood.seen[:, None] * (frame.y - look(model, x)))
         f = each(partial(balance.apply, linear.dr_dx), positions) + Q @ errors.amplitudes
         f = f.at[:, :, 0].add(linear.unbalanced)
-        squared = jnp.sum(f**2, axis=(1, 2))
-        squared = squared + window_sums(balance.layout, errors.position_covariance, balance.places, linear.dr_dx)
+        left = window_sums(balance.layout, errors.position_covariance, balance.places, linear.dr_dx)
+        squared = left + jnp.sum(f**2, axis=(1, 2))
         weight = jnp.where(known, linear.weight, 1.0)
         log_square = window_sums(balance.layout, of_square, balance.places, likelihood.inner(linear.dr_dx))
-        return 0.5 * jnp.sum(jnp.where(known, weight * squared - 3 * jnp.log(weight) - log_square, 0.0))
+        total = 0.5 * jnp.sum(jnp.where(known, weight * squared - 3 * jnp.log(weight) - log_square, 0.0))
+        return total, ForceErrors.of(likelihood, f, left)
 
-    along_theta, along_s, along_x = jax.grad(expected, argnums=(0, 1, 2))(theta, s, x)
+    (along_theta, along_s, along_x), found = jax.grad(expected, argnums=(0, 1, 2), has_aux=True)(theta, s, x)
     balance_slope = adjoint(likelihood.balance, likelihood.frame, along_x[:, :, None])[:, :, 0]
     of_theta, of_s = jax.vjp(lambda *at: gripped_forces(sheet, *at, frame, context, x), theta, s)[1](balance_slope)
-    return along_s - of_s, along_theta - of_theta
+    return FrameSlope(of_s=along_s - of_s, of_theta=along_theta - of_theta, force_errors=found)

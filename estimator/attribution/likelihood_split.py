@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..parallel_map import parallel_map
-from .every_frame import field_information, residual
+from .every_frame import field_information
 from .frame_likelihood import FrameLikelihood
 from .gauss_newton import Weighed
 from .normal_equations import offset_share
@@ -55,7 +55,7 @@ class LikelihoodSplit:
 def likelihood_split(fit: Weighed) -> LikelihoodSplit:
     """Return the parts of a fit's log likelihood; frames are in the order of its weights."""
     problem, weights = fit.problem, fit.weights
-    every, variance = residual(problem, weights, fit.point), problem.scales.tool
+    every, variance = fit.residuals, problem.scales.tool
     fields, tool, grasps = dict[int, np.ndarray](), dict[int, float](), 0.0
     for frames in problem.by_part(weights).values():
         precision, products = field_information(problem, weights, every, frames)

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from ..belief.gaussian_information import GaussianInformation
 from .frame_likelihood import N_FIELDS
 from .grasped_frames import ClosedFrame
-from .linear import NormalEquations, grasp_sd, tool_sd
+from .linear import NormalEquations, WeightedResiduals, grasp_sd, tool_sd
 from .problem import Problem
 from .tool_pull import pull_products
 
@@ -32,46 +32,20 @@ def reduced(problem: Problem, equations: dict[int, NormalEquations], d: int) -> 
     return np.asarray(total)
 
 
-def whole_slope(
-    problem: Problem,
-    equations: dict[int, NormalEquations],
-    slopes: dict[int, tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]],
-    free: np.ndarray,
-) -> Float[np.ndarray, " k"]:
-    """Return the slope of -ln likelihood by s and the free parameters, that of all weights included [nat].
-
-    Args:
-        problem: what is fitted to.
-        equations: of all frames, along the free parameters.
-        slopes: that of each frame's forces by s and by all parameters; see `likelihood_slope`.
-        free: indices of the free parameters.
-    """
-    n, d = len(next(iter(slopes.values()))[0]), len(free)
-    total = np.sum([np.append(of_s, of_theta[free]) for of_s, of_theta in slopes.values()], axis=0)
-    for frames in problem.by_part(equations).values():
-        closed = [problem.history.frames[k].frame for k in frames]
-        rows = np.array([np.asarray(equations[k].tool) for k in frames])
-        total[n:] += less_offset(rows, closed[0])[:d, -1] / problem.scales.tool
-        if problem.scales.pull is not None and problem.with_force(frames):
-            pulls = np.array([np.asarray(equations[k].pull) for k in frames])
-            total += pull_products(pulls, closed)[: n + d, -1] / problem.scales.pull
-    return total
-
-
-def tool_sum(problem: Problem, equations: dict[int, NormalEquations]) -> float:
+def tool_sum(problem: Problem, residuals: dict[int, WeightedResiduals]) -> float:
     """Return the sum of the tool's squared residuals over all frames, over the assumed variances."""
     total = 0.0
-    for frames in problem.by_part(equations).values():
-        rows = np.array([np.asarray(equations[k].tool)[:, -1:] for k in frames])
+    for frames in problem.by_part(residuals).values():
+        rows = np.array([np.asarray(residuals[k].tool)[:, None] for k in frames])
         total += float(less_offset(rows, problem.history.frames[frames[0]].frame)[0, 0])
     return total
 
 
-def pull_sum(problem: Problem, equations: dict[int, NormalEquations]) -> float:
+def pull_sum(problem: Problem, residuals: dict[int, WeightedResiduals]) -> float:
     """Return the sum of the squared residuals of the tool's force over all frames, over the assumed variances."""
     total = 0.0
-    for frames in problem.by_part(one for one in equations if problem.with_force([one])).values():
-        rows = np.array([np.asarray(equations[k].pull)[:, -1:] for k in frames])
+    for frames in problem.by_part(one for one in residuals if problem.with_force([one])).values():
+        rows = np.array([np.asarray(residuals[k].pull)[:, None] for k in frames])
         total += float(pull_products(rows, [problem.history.frames[k].frame for k in frames])[0, 0])
     return total
 

@@ -1,16 +1,20 @@
-"""Refine a fit by the whole slope of its likelihood: of the parameters, and of s of the particles that are attached.
+"""Refine a fit by the whole slope of its likelihood: parameters, s of the attached particles, and noise scales.
 
 Gauss-Newton steps take the weights of the residuals and the determinants as given, so they end where only the residuals
-fit best. Where a model is wrong, the likelihood goes on rising from there by hundreds of nat.
+fit best. Where a model is wrong, the likelihood goes on rising from there by hundreds of nat. The curvature along each
+step follows from the slopes at both of its ends [BFGS: Nocedal & Wright 2006, doi:10.1007/978-0-387-40065-5, eq. 6.19].
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
-from .gauss_newton import MAX_CHANGE, MIN_GAIN, Fitted, Step, Weighed, after_step, applied, improved
-from .likelihood_slope import likelihood_slopes
-from .normal_equations import whole_slope
+from .gauss_newton import MAX_CHANGE, MIN_GAIN, Fitted, Step, Weighed, after_step, applied, cost, linearised_fit
+from .likeliest_scales import likelier_force, with_likeliest_others
+from .likelihood_slope import likelihood_slopes, whole_slope
+from .noise_scales import NoiseScales
 
 MAX_REFINEMENTS = 8
 """Largest number of refining steps."""
@@ -18,56 +22,118 @@ MIN_PROMISE = 10.0
 """Fall of the cost, by its slope, from which a refining step is tried [nat, doubled]: half of it is left at its end."""
 MAX_LENGTHS = 3
 """Largest number of lengths of a step that are tried."""
-MIN_INFORMATION = 1e-6
+MIN_INFORMATION = 0.5
 """Information about each s that is assumed at least: no frame may show an attachment."""
+MAX_LOG_CHANGE = 0.7
+"""Largest change of ln s / (1 - s) in one step."""
 SHARES = (0.1, 0.5)
 """Range of the length of each, in that of the one before."""
+MIN_BEND = 0.1
+"""Least curvature along a step that is used, in that assumed before it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Slope:
+    """The slope of -ln likelihood and prior at a fit by s and the free parameters."""
+
+    place: Float[np.ndarray, " k"]
+    """Values of s and of the free parameters."""
+    slope: Float[np.ndarray, " k"]
+    """The slope [nat]."""
+    hessian: Float[np.ndarray, "k k"]
+    """The curvature, by the normal equations and the determinants [nat]."""
+    scales: NoiseScales
+    """Noise scales that are likelier there."""
 
 
 def refined(begun: Fitted, *, log: Callable[[str], None] = lambda _: None) -> Fitted:
-    """Return the fit after refining steps, with the noise scales that it has."""
-    return improved(begun, refined_point, passes=MAX_REFINEMENTS, step="refinement", log=log)
+    """Return the fit after refining steps."""
+    now, before = begun, None
+    for count in range(MAX_REFINEMENTS):
+        slope = _slope(now)
+        if (there := _better(now, slope, before)) is None:
+            break
+        last, now, before = now, linearised_fit(there, now.named), slope
+        log(f"refinement {count + 1}: {last.cost / 2:.1f} -> {now.cost / 2:.1f} nat")
+    return now
 
 
-def refined_point(now: Fitted) -> Weighed | None:
-    """Return a point of lower cost along the step by the whole slope; None if none is found.
+def _better(now: Fitted, slope: _Slope, before: _Slope | None) -> Weighed | None:
+    """Return a point of lower cost along the step, with likelier noise scales; None if none is found.
 
     Each try after the whole step is where the parabola through the cost and its slope at the start, and the cost at the
     try before, is least.
     """
-    step, slope = refining_step(now)
+    step, promise = _step(now, slope, before)
     share = 1.0
     for _ in range(MAX_LENGTHS):
-        if not -slope * share > MIN_PROMISE:
+        if not promise * share > MIN_PROMISE:
             return None
-        there, cost = after_step(now, step, share)
-        if cost < now.cost - MIN_GAIN:
+        there = with_likeliest_others(after_step(now, step, share, slope.scales))
+        rise = cost(there, now.named) - now.cost
+        if rise < -MIN_GAIN:
             return there
-        rise = cost - now.cost - slope * share
-        share *= float(np.clip(-slope * share / (2 * rise), *SHARES))
+        share *= float(np.clip(promise * share / (2 * (rise + promise * share)), *SHARES))
     return None
 
 
-def refining_step(now: Fitted) -> tuple[Step, float]:
-    """Return the step of the parameters and of the attached particles' s by the whole slope, and the cost's slope.
+def _slope(now: Fitted) -> _Slope:
+    """Return the slope at a fit.
 
     The normal equations have the slope and the curvature of the residuals alone. The determinants add to both. A spring
     against a compliance k adds -3 ln(1 + k s) to the log determinant of a frame, with slope -3 k and curvature 3 k^2:
     the curvature of half of it is two thirds of the square of its own slope.
     """
     n, sd, point = len(now.point.s), now.problem.sd(now.named), now.point
-    slope = whole_slope(now.problem, now.equations, likelihood_slopes(now.problem, point, now.weights), now.free)
+    of_frames = likelihood_slopes(now)
+    slope = whole_slope(now, of_frames)
+    hessian = now.square[:-1, :-1].copy()
+    of_determinants = slope[:n] - now.square[:n, -1]
+    hessian[range(n), range(n)] += of_determinants**2 / (3 * len(now.equations))
+    hessian[range(n, n + len(sd)), range(n, n + len(sd))] += sd**-2
+    slope[n:] += point.theta[now.free] / sd**2
+    force = np.exp(likelier_force(now.problem, (one.force_errors for one in of_frames.values())))
+    return _Slope(
+        place=np.append(point.s, point.theta[now.free]),
+        slope=slope,
+        hessian=hessian,
+        scales=replace(now.problem.scales, force=float(force)),
+    )
+
+
+def _step(now: Fitted, at: _Slope, before: _Slope | None) -> tuple[Step, float]:
+    """Return the step of parameters and of the attached particles' s, and by how much it promises to lower the cost.
+
+    It is solved for the logarithms of s / (1 - s), in which the likelihood is closer to a parabola.
+
+    Args:
+        now: where it begins.
+        at: the slope there.
+        before: the slope where the step before began.
+    """
+    n, sd, point = len(now.point.s), now.problem.sd(now.named), now.point
     kept = np.concatenate([np.flatnonzero(point.s > 0), n + np.arange(len(sd))])
-    of_s, of_theta = np.split(np.arange(len(kept)), [len(kept) - len(sd)])
-    hessian, slope = now.square[np.ix_(kept, kept)].copy(), slope[kept]
-    of_determinants = slope[of_s] - now.square[kept[of_s], -1]
-    hessian[of_s, of_s] += of_determinants**2 / (3 * len(now.equations)) + MIN_INFORMATION
-    hessian[of_theta, of_theta] += sd**-2
-    slope[of_theta] += point.theta[now.free] / sd**2
-    best = -np.linalg.solve(hessian, slope)
-    theta, s = np.zeros(len(point.theta)), np.zeros(n)
-    theta[now.free] = np.clip(best[of_theta], -MAX_CHANGE * sd, MAX_CHANGE * sd)
-    s[kept[of_s]] = best[of_s]
-    to_theta, to_s = applied(now, (theta, s), 1.0)
-    change = np.concatenate([to_s - point.s, (to_theta - point.theta)[now.free]])[kept]
-    return (theta, s), 2 * float(slope @ change)
+    unit = np.append(point.s * (1 - point.s), np.ones(len(sd)))
+    largest = np.append(np.full(n, MAX_LOG_CHANGE), MAX_CHANGE * sd)
+    least = np.append(np.full(n, MIN_INFORMATION), np.zeros(len(sd)))
+    hessian = (at.hessian * np.outer(unit, unit) + np.diag(least))[np.ix_(kept, kept)]
+    best = np.zeros(n + len(sd))
+    best[kept] = -np.linalg.solve(hessian, (unit * at.slope)[kept])
+    best = np.clip(best, -largest, largest)
+    theta = np.zeros(len(point.theta))
+    theta[now.free] = best[n:]
+    step = (theta, unit[:n] * np.expm1(best[:n]) / (1 + point.s * np.expm1(best[:n])))
+    to_theta, to_s = applied(now, step, 1.0)
+    change = np.append(to_s - point.s, (to_theta - point.theta)[now.free])
+    return step, -2 * float(at.slope @ change)
+
+
+def _bent(
+    hessian: Float[np.ndarray, "k k"], step: Float[np.ndarray, " k"], change: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "k k"]:
+    """Return a curvature that agrees with the change of the slope over the last step, if that has enough of it."""
+    along = hessian @ step
+    assumed, found = float(step @ along), float(step @ change)
+    if not found > MIN_BEND * assumed > 0:
+        return hessian
+    return hessian - np.outer(along, along) / assumed + np.outer(change, change) / found

@@ -228,7 +228,7 @@ class ForceBalance(eqx.Module):
         """Return the balance of forces linearised at x and s."""
         evidence = evidence.near(x)
         internal, error = self._internal_dr_dx(x), self.error(x)
-        weight = self._weight(error, s, evidence)
+        weight = self.weight(error, s, evidence)
         identity = (self.neighbours == jnp.arange(len(x))[:, None])[:, :, None, None]
         identity = jnp.where(identity, jnp.eye(3, dtype=x.dtype), 0.0)
         dr_dx = (1 - s)[:, None, None, None] * internal + (s * self.reference)[:, None, None, None] * identity
@@ -333,7 +333,7 @@ class ForceBalance(eqx.Module):
         share = self.config.error_weight * error / jnp.maximum(jnp.sum(frame.dr_ds**2, axis=1), MIN_SQUARE)
         return jnp.maximum(1 - share, 0.0)[:, None] * frame.dr_ds
 
-    def _weight(self, error: Float[Array, " n"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, " n"]:
+    def weight(self, error: Float[Array, " n"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, " n"]:
         """Return W, the inverse variance of r at each particle [1/N^2]."""
         variance = ((1 - s) * error) ** 2 + (s * self.reference * self.anchor_sd) ** 2
         return jnp.where(evidence.force_unknown, 0.0, 1 / variance)
@@ -347,7 +347,7 @@ class ForceBalance(eqx.Module):
         self, frame: Frame, move: Float[Array, "n 3"], s: Float[Array, " n"]
     ) -> tuple[Float[Array, "n 3"], Float[Array, " _lengths"]]:
         """Return the point of least cost among a few along a move from a frame's state, and the costs of all."""
-        evidence, weight = frame.evidence, self._weight(frame.error, s, frame.evidence)
+        evidence, weight = frame.evidence, self.weight(frame.error, s, frame.evidence)
 
         def cost(length: Float[Array, ""]) -> Float[Array, ""]:
             x = frame.x + length * move
@@ -388,7 +388,7 @@ class ForceBalance(eqx.Module):
         pull = jnp.einsum("nij,nj->ni", evidence.white_precision, evidence.y - frame.x)
         d, free = frame.x - self.energy.rest, (1 - s)[:, None]
         unbalanced = self.reference * d - free * frame.dr_ds
-        weighted = self._weight(frame.error, s, evidence)[:, None] * unbalanced
+        weighted = self.weight(frame.error, s, evidence)[:, None] * unbalanced
         push = self.reference * weighted - self.transposed(frame.dD_dx, free * weighted)
         if frame.smooth is not None:
             pull = pull + frame.smooth.added_pull(evidence.y - frame.x)

@@ -71,6 +71,7 @@ def small_fit(
         square=np.zeros((len(named) + 2, len(named) + 2)),
         equations={},
         weights={},
+        residuals={},
         summary=summary,
         log_likelihood=0.0,
     )

@@ -103,7 +103,7 @@ def test_a_step_that_fails_as_a_whole_is_shortened(light, monkeypatch):
 
 
 def test_an_effect_more_does_not_make_a_fit_less_likely(light):
-    """It may begin where the fit without it ended. A fit that cannot be worth it does not move under its scales."""
+    """It may begin where the fit without it ended. A fit that cannot be worth it does not move from there."""
     closed = light[0]
     problem, before = closed.problem, closed.final
     frames = list(before.fitted.equations)
@@ -112,7 +112,8 @@ def test_an_effect_more_does_not_make_a_fit_less_likely(light):
         more = fit(problem, named, [before.fits.assumed.point], frames, before=before.fits).likeliest
         hopeless = fit(problem, named, [before.fits.assumed.point], frames, before=before.fits, worth=np.inf)
     assert more.log_posterior >= before.fitted.log_posterior - stepping.MIN_GAIN
-    np.testing.assert_array_equal(hopeless.likeliest.point.theta, hopeless.assumed.point.theta)
+    begun = (hopeless.assumed.point.theta, before.fitted.point.theta)
+    assert any(np.array_equal(hopeless.likeliest.point.theta, one) for one in begun)
 
 
 def test_a_fit_without_a_part_uses_the_other_frames_alone(light):

@@ -63,7 +63,8 @@ def test_a_restored_fit_has_the_evidence_that_it_had(light, kept):
     with jax.enable_x64(True), one_thread():
         for one, (hypothesis, _) in zip(kept.fits, closed.hypotheses, strict=True):
             restored = one.restored(closed.problem, closed.problem.frames(dataset.parts[0])).likeliest
-            assert restored.log_likelihood == pytest.approx(hypothesis.fitted.log_likelihood, rel=1e-12)
+            # the errors of the fit were rescaled, those of the restored one are built anew: they round otherwise
+            assert restored.log_likelihood == pytest.approx(hypothesis.fitted.log_likelihood, rel=1e-10)
             assert log_model_evidence(restored) == pytest.approx(hypothesis.log_evidence, rel=1e-9)
 
 

@@ -8,8 +8,7 @@ import pytest
 
 from jiggle_mj.estimator.attribution import refinement
 from jiggle_mj.estimator.attribution.gauss_newton import linearise_at, moved, start, weigh
-from jiggle_mj.estimator.attribution.likelihood_slope import likelihood_slopes
-from jiggle_mj.estimator.attribution.normal_equations import whole_slope
+from jiggle_mj.estimator.attribution.likelihood_slope import likelihood_slopes, whole_slope
 from jiggle_mj.estimator.attribution.refinement import refined
 from jiggle_mj.estimator.blas import one_thread
 
@@ -47,7 +46,7 @@ def test_the_slope_is_that_of_finite_differences(light, shared):
             return -weigh(problem, settled(theta, s), frames).log_likelihood
 
         at = linearise_at(problem, fitted.named, settled(fitted.point.theta, s), frames)
-        found = whole_slope(problem, at.equations, likelihood_slopes(problem, at.point, at.weights), free)
+        found = whole_slope(at, likelihood_slopes(at))
         unit = np.zeros(problem.sheet.size)
         of_theta: list[float] = []
         for k, size in zip(free, sd, strict=True):

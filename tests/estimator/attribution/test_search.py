@@ -34,6 +34,7 @@ def test_the_search_is_over_frames_of_all_parts_with_the_last_of_each(light, mon
     problem = light[0].problem
     frames = list(range(len(problem.history.frames)))
     monkeypatch.setattr(hypotheses, "N_SEARCHED", largest)
+    monkeypatch.setattr(hypotheses, "MAX_SEARCHED", largest)
     found = searched_frames(problem, frames)
     assert found == sorted(set(found)) and set(found) <= set(frames)
     parts = problem.by_part(frames)

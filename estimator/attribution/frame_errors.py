@@ -1,0 +1,120 @@
+"""What a frame's observed positions say of its errors: of positions, of smooth fields and of forces.
+
+With the terms of `likelihood_slope`, the noise n_y of the positions, the amplitudes a of the smooth noise and c of the
+smooth force fields are normal given the frames, and the force error is f = H (y - h(x) + F a - n_y) + r + Q c.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..filters.smooth_noise import each
+from ..physics.block_tridiagonal import BlockTridiagonal, inverse_band, window_sums
+from .every_frame import each_frame, field_information
+from .frame_likelihood import N_FIELDS, FrameLikelihood, seen_noise
+from .gauss_newton import Weighed
+from .grasped_frames import ClosedFrame
+
+
+class FieldAmplitudes(eqx.Module):
+    """What the frames of a grasp say of the amplitudes c of its smooth force fields."""
+
+    mean: Float[Array, " q"]
+    """Mean."""
+    root: Float[Array, "q q"]
+    """Lower Cholesky factor of the covariance."""
+
+
+class FrameErrors(eqx.Module):
+    """What a frame's positions say of their errors: of F a - n_y and of c, each with the mean first.
+
+    The other columns are those of a root of the covariance, less the part that n_y has with a and c known.
+    """
+
+    positions: Float[Array, "n 3 k"]
+    """Errors F a - n_y of the positions [m]."""
+    amplitudes: Float[Array, "q k"]
+    """Amplitudes c."""
+    position_covariance: BlockTridiagonal
+    """Covariance of n_y with a and c known [m^2]."""
+
+
+class ForceErrors(eqx.Module):
+    """What a frame says of the size of the model's force errors, a part of all errors of its forces."""
+
+    squared: Float[Array, ""]
+    """Sum of the squares of the mean errors, each over its variance."""
+    degrees: Float[Array, ""]
+    """Number of errors that the frame determines: their number less what is left of their variances."""
+    count: Float[Array, ""]
+    """Their number; one that is a part of an error counts as that part."""
+
+    @classmethod
+    def of(cls, likelihood: FrameLikelihood, f: Float[Array, "n 3 k"], left: Float[Array, " n"]) -> "ForceErrors":
+        """Return what there is to say of errors of forces, given their mean and columns of a root [N].
+
+        Args:
+            likelihood: weights of the forces.
+            f: mean errors of all forces, then columns whose squares sum to a part of what is left of their variances.
+            left: the other part, of all three directions [N^2].
+        """
+        share, weight = likelihood.force_share, likelihood.frame.weight
+        left = left + jnp.sum(f[:, :, 1:] ** 2, axis=(1, 2))
+        squared = share * weight * jnp.sum(f[:, :, 0] ** 2, axis=1)
+        degrees = jnp.sum(share * (3 - weight * left))
+        return cls(squared=jnp.sum(squared), degrees=degrees, count=3 * jnp.sum(share))
+
+
+def field_amplitudes(at: Weighed) -> dict[int, FieldAmplitudes]:
+    """Return what is known of the amplitudes of the smooth force fields in each frame's grasp."""
+    found = dict[int, FieldAmplitudes]()
+    for frames in at.problem.by_part(at.weights).values():
+        precision, products = field_information(at.problem, at.weights, at.residuals, frames)
+        covariance = np.linalg.inv(precision)
+        mean = jnp.asarray(-covariance @ products)
+        one = FieldAmplitudes(mean=mean, root=jnp.asarray(np.linalg.cholesky(covariance)))
+        found |= dict.fromkeys(frames, one)
+    return found
+
+
+def frame_errors(
+    likelihood: FrameLikelihood, smooth: Float[Array, "n 3 m"], e: Float[Array, "n 3"], fields: FieldAmplitudes
+) -> FrameErrors:
+    """Return what is known of a frame's errors, with the smooth noise's fields F [m] and e = H (y - h(x)) + r [N]."""
+    balance, frame = likelihood.balance, likelihood.frame
+    m = smooth.shape[2]
+    c = jnp.concatenate([fields.mean[:, None], fields.root, jnp.zeros((N_FIELDS, m))], axis=1)
+    forces = likelihood.fields @ c
+    forces = forces.at[:, :, 0].add(e)
+    a = -jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nim,nik->mk", likelihood.noise, forces))
+    a = a.at[:, 1 + N_FIELDS :].add(jax.scipy.linalg.solve_triangular(likelihood.spread.T, jnp.eye(m)))
+    seen = smooth @ a
+    forces = forces + each(partial(balance.apply, frame.dr_dx), seen)
+    explained = each(partial(balance.explained, frame), forces)
+    return FrameErrors(positions=seen - explained, amplitudes=c, position_covariance=inverse_band(frame.factor))
+
+
+def force_errors(at: Weighed) -> dict[int, ForceErrors]:
+    """Return what each frame of a point says of the size of its force errors."""
+    amplitudes, noise = field_amplitudes(at), jnp.asarray(at.problem.noise)
+
+    def one(k: int, frame: ClosedFrame, *_: object) -> ForceErrors:
+        found = _force_errors(at.weights[k], seen_noise(frame, noise), at.residuals[k].forces, amplitudes[k])
+        return jax.block_until_ready(found)
+
+    return each_frame(at.problem, at.point, at.weights, one)
+
+
+@eqx.filter_jit
+def _force_errors(
+    likelihood: FrameLikelihood, smooth: Float[Array, "n 3 m"], e: Float[Array, "n 3"], fields: FieldAmplitudes
+) -> ForceErrors:
+    balance, linear = likelihood.balance, likelihood.frame
+    errors = frame_errors(likelihood, smooth, e, fields)
+    f = each(partial(balance.apply, linear.dr_dx), errors.positions) + likelihood.fields @ errors.amplitudes
+    left = window_sums(balance.layout, errors.position_covariance, balance.places, linear.dr_dx)
+    return ForceErrors.of(likelihood, f.at[:, :, 0].add(e), left)
