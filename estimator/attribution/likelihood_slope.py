@@ -116,5 +116,5 @@ def frame_slope(
 
     (along_theta, along_s, along_x), found = jax.grad(expected, argnums=(0, 1, 2), has_aux=True)(theta, s, x)
     balance_slope = adjoint(likelihood.balance, likelihood.frame, along_x[:, :, None])[:, :, 0]
-    of_theta, of_s = jax.vjp(lambda *at: gripped_forces(sheet, *at, frame, context, x), theta, s)[1](balance_slope)
+    of_theta, of_s = jax.vjp(lambda a, b: gripped_forces(sheet, a, b, frame, context, x), theta, s)[1](balance_slope)
     return FrameSlope(of_s=along_s - of_s, of_theta=along_theta - of_theta, force_errors=found)

@@ -1,8 +1,7 @@
 """Refine a fit by the whole slope of its likelihood: parameters, s of the attached particles, and noise scales.
 
 Gauss-Newton steps take the weights of the residuals and the determinants as given, so they end where only the residuals
-fit best. Where a model is wrong, the likelihood goes on rising from there by hundreds of nat. The curvature along each
-step follows from the slopes at both of its ends [BFGS: Nocedal & Wright 2006, doi:10.1007/978-0-387-40065-5, eq. 6.19].
+fit best. Where a model is wrong, the likelihood goes on rising from there by hundreds of nat.
 """
 
 from collections.abc import Callable
@@ -11,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from .gauss_newton import MAX_CHANGE, MIN_GAIN, Fitted, Step, Weighed, after_step, applied, cost, linearised_fit
+from .gauss_newton import MAX_CHANGE, MIN_GAIN, Fitted, Step, Weighed, after_step, applied, cost, improved
 from .likeliest_scales import likelier_force, with_likeliest_others
 from .likelihood_slope import likelihood_slopes, whole_slope
 from .noise_scales import NoiseScales
@@ -28,16 +27,12 @@ MAX_LOG_CHANGE = 0.7
 """Largest change of ln s / (1 - s) in one step."""
 SHARES = (0.1, 0.5)
 """Range of the length of each, in that of the one before."""
-MIN_BEND = 0.1
-"""Least curvature along a step that is used, in that assumed before it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Slope:
     """The slope of -ln likelihood and prior at a fit by s and the free parameters."""
 
-    place: Float[np.ndarray, " k"]
-    """Values of s and of the free parameters."""
     slope: Float[np.ndarray, " k"]
     """The slope [nat]."""
     hessian: Float[np.ndarray, "k k"]
@@ -48,23 +43,17 @@ class _Slope:
 
 def refined(begun: Fitted, *, log: Callable[[str], None] = lambda _: None) -> Fitted:
     """Return the fit after refining steps."""
-    now, before = begun, None
-    for count in range(MAX_REFINEMENTS):
-        slope = _slope(now)
-        if (there := _better(now, slope, before)) is None:
-            break
-        last, now, before = now, linearised_fit(there, now.named), slope
-        log(f"refinement {count + 1}: {last.cost / 2:.1f} -> {now.cost / 2:.1f} nat")
-    return now
+    return improved(begun, _better, passes=MAX_REFINEMENTS, step="refinement", log=log)
 
 
-def _better(now: Fitted, slope: _Slope, before: _Slope | None) -> Weighed | None:
+def _better(now: Fitted) -> Weighed | None:
     """Return a point of lower cost along the step, with likelier noise scales; None if none is found.
 
     Each try after the whole step is where the parabola through the cost and its slope at the start, and the cost at the
     try before, is least.
     """
-    step, promise = _step(now, slope, before)
+    slope = _slope(now)
+    step, promise = _step(now, slope)
     share = 1.0
     for _ in range(MAX_LENGTHS):
         if not promise * share > MIN_PROMISE:
@@ -94,22 +83,16 @@ def _slope(now: Fitted) -> _Slope:
     slope[n:] += point.theta[now.free] / sd**2
     force = np.exp(likelier_force(now.problem, (one.force_errors for one in of_frames.values())))
     return _Slope(
-        place=np.append(point.s, point.theta[now.free]),
         slope=slope,
         hessian=hessian,
         scales=replace(now.problem.scales, force=float(force)),
     )
 
 
-def _step(now: Fitted, at: _Slope, before: _Slope | None) -> tuple[Step, float]:
+def _step(now: Fitted, at: _Slope) -> tuple[Step, float]:
     """Return the step of parameters and of the attached particles' s, and by how much it promises to lower the cost.
 
     It is solved for the logarithms of s / (1 - s), in which the likelihood is closer to a parabola.
-
-    Args:
-        now: where it begins.
-        at: the slope there.
-        before: the slope where the step before began.
     """
     n, sd, point = len(now.point.s), now.problem.sd(now.named), now.point
     kept = np.concatenate([np.flatnonzero(point.s > 0), n + np.arange(len(sd))])
@@ -126,14 +109,3 @@ def _step(now: Fitted, at: _Slope, before: _Slope | None) -> tuple[Step, float]:
     to_theta, to_s = applied(now, step, 1.0)
     change = np.append(to_s - point.s, (to_theta - point.theta)[now.free])
     return step, -2 * float(at.slope @ change)
-
-
-def _bent(
-    hessian: Float[np.ndarray, "k k"], step: Float[np.ndarray, " k"], change: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, "k k"]:
-    """Return a curvature that agrees with the change of the slope over the last step, if that has enough of it."""
-    along = hessian @ step
-    assumed, found = float(step @ along), float(step @ change)
-    if not found > MIN_BEND * assumed > 0:
-        return hessian
-    return hessian - np.outer(along, along) / assumed + np.outer(change, change) / found
