@@ -11,7 +11,7 @@ error of the model and are the same in all frames of a grasp. So the log density
     -1/2 [e^T (N + H F F^T H^T)^-1 e + ln |N + H F F^T H^T| - 2 ln |H|]
 
 up to a constant. A model that yields more has a wider density, so a comparison of models needs both determinants. c is
-eliminated grasp by grasp (`every_frame.cost`).
+eliminated grasp by grasp (`every_frame.misfit_of`).
 """
 
 from dataclasses import replace
@@ -28,7 +28,7 @@ from ..filters.evidence import Evidence
 from ..filters.force_balance import ForceBalance
 from ..filters.frame import Frame
 from ..filters.smooth_noise import each
-from ..physics.block_tridiagonal import BlockCholesky, add_to_diagonal, assemble, cholesky, log_det
+from ..physics.block_tridiagonal import BlockCholesky, log_det, normal_cholesky
 from ..physics.membrane import TriangleMembrane
 from .grasped_frames import ClosedFrame
 from .sheet import PredictedSheet, mean_of_held
@@ -108,7 +108,7 @@ class FrameLikelihood(eqx.Module):
         """Return the factor of H^T H over the particles with a force equation, with an identity for the others."""
         balance, known, rows = self.balance, self.frame.weight > 0, self.inner(self.frame.dr_dx)
         inputs = jnp.where(known[:, None, None], 0.0, jnp.eye(3)[None])
-        return _factor(balance, rows, known.astype(float), inputs)
+        return normal_cholesky(balance.layout, balance.places, rows, known.astype(float), inputs)
 
 
 def frame_likelihood(
@@ -148,17 +148,9 @@ def _with_force_sd(
     balance, linear = replace(likelihood.balance, force_sd=force_sd), likelihood.frame
     error = factor * linear.error
     weight = balance.weight(error, linear.s, linear.evidence)
-    precision = linear.evidence.white_precision + balance.config.position_precision_floor * jnp.eye(3)[None]
-    root = _factor(balance, linear.dr_dx, weight, precision)
+    precision = balance.position_precision(linear.evidence)
+    root = normal_cholesky(balance.layout, balance.places, linear.dr_dx, weight, precision)
     return balance, replace(linear, error=error, weight=weight, factor=root), factor * likelihood.fields
-
-
-def _factor(
-    balance: ForceBalance, rows: Float[Array, "n p 3 3"], weight: Float[Array, " n"], diagonal: Float[Array, "n 3 3"]
-) -> BlockCholesky:
-    """Return the factor of H^T W H and a diagonal, for the rows of H."""
-    square = assemble(balance.layout, [(balance.places, jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows))])
-    return cholesky(add_to_diagonal(balance.layout, square, diagonal))
 
 
 @eqx.filter_jit

@@ -99,7 +99,7 @@ def _squares(
     a = jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nic,ni->c", likelihood.noise, z))
     weighted = white - likelihood.noise @ a  # w f, and R^-1 d = H^T w f
     w, pull = frame.weight, balance.transposed(frame.dr_dx, weighted)
-    precision = frame.evidence.white_precision + balance.config.position_precision_floor * jnp.eye(3)[None]
+    precision = balance.position_precision(frame.evidence)
     of_forces = jnp.where(w > 0, jnp.sum(weighted**2, axis=1) / jnp.where(w > 0, w, 1.0), 0.0)
     of_positions = jnp.einsum("ni,ni->n", pull, jnp.linalg.solve(precision, pull[:, :, None])[:, :, 0])
     return of_forces + of_positions, jnp.sum(a**2)

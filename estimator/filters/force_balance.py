@@ -28,11 +28,9 @@ from jaxtyping import Array, Float, Int
 
 from ..physics.block_tridiagonal import (
     Layout,
-    add_to_diagonal,
-    assemble,
-    cholesky,
     inverse_band,
     lower_square,
+    normal_cholesky,
     solve,
     window_sums,
 )
@@ -232,11 +230,8 @@ class ForceBalance(eqx.Module):
         identity = (self.neighbours == jnp.arange(len(x))[:, None])[:, :, None, None]
         identity = jnp.where(identity, jnp.eye(3, dtype=x.dtype), 0.0)
         dr_dx = (1 - s)[:, None, None, None] * internal + (s * self.reference)[:, None, None, None] * identity
-        squares = jnp.einsum("n,npij,nqik->npjqk", weight, dr_dx, dr_dx)
-        A = assemble(self.layout, [(self.places, squares)])
-        floor = self.config.position_precision_floor
-        precision, fields = evidence.white_precision + floor * jnp.eye(3)[None], evidence.seen_fields
-        factor = cholesky(add_to_diagonal(self.layout, A, precision))
+        precision, fields = self.position_precision(evidence), evidence.seen_fields
+        factor = normal_cholesky(self.layout, self.places, dr_dx, weight, precision)
         return Frame(
             x=x,
             s=s,
@@ -301,7 +296,7 @@ class ForceBalance(eqx.Module):
         evidence = frame.evidence
         w, free, smooth = frame.weight, evidence.seen & ~evidence.held, frame.smooth
         fitted = w * window_sums(self.layout, fit.covariance, self.places, frame.dr_dx)
-        white = evidence.white_precision + self.config.position_precision_floor * jnp.eye(3)[None]
+        white = self.position_precision(evidence)
         root = jnp.linalg.cholesky(jnp.where(free[:, None, None], white, jnp.eye(3)))
         root = jnp.where(free[:, None, None], jnp.swapaxes(root, 1, 2), 0.0)
         seen = window_sums(self.layout, fit.covariance, self.own_place, root[:, None])
@@ -332,6 +327,10 @@ class ForceBalance(eqx.Module):
             error = error + frame.smooth.spread_of(partial(self.apply, frame.dD_dx))
         share = self.config.error_weight * error / jnp.maximum(jnp.sum(frame.dr_ds**2, axis=1), MIN_SQUARE)
         return jnp.maximum(1 - share, 0.0)[:, None] * frame.dr_ds
+
+    def position_precision(self, evidence: Evidence) -> Float[Array, "n 3 3"]:
+        """Return R^-1 of the white noise, with `FilterConfig.position_precision_floor` [1/m^2]."""
+        return evidence.white_precision + self.config.position_precision_floor * jnp.eye(3)[None]
 
     def weight(self, error: Float[Array, " n"], s: Float[Array, " n"], evidence: Evidence) -> Float[Array, " n"]:
         """Return W, the inverse variance of r at each particle [1/N^2]."""

@@ -162,6 +162,26 @@ def cholesky(matrix: BlockTridiagonal) -> BlockCholesky:
     return BlockCholesky(inverse=inverse, inward=inward, middle=inverse_factor(middle - taken[0] - taken[1]))
 
 
+def normal_cholesky(
+    layout: Layout,
+    index: Int[Array, "m p p"],
+    rows: Float[Array, "m p 3 3"],
+    weight: Float[Array, " m"],
+    diagonal: Float[Array, "n 3 3"],
+) -> BlockCholesky:
+    """Return the factor of H^T W H and a diagonal.
+
+    Args:
+        layout: the layout of the matrix.
+        index: `Layout.pair_index` of each row of H.
+        rows: the rows, one 3x3 window per vertex.
+        weight: W of each row.
+        diagonal: a 3x3 window that is added for each particle.
+    """
+    squares = jnp.einsum("n,npij,nqik->npjqk", weight, rows, rows)
+    return cholesky(add_to_diagonal(layout, assemble(layout, [(index, squares)]), diagonal))
+
+
 def log_det(factor: BlockCholesky) -> Float[Array, ""]:
     """Return ln |A| of the factorised matrix; NaN where it is not positive definite."""
     diagonals = [jnp.diagonal(part, axis1=-2, axis2=-1) for part in (factor.inverse, factor.middle)]
