@@ -11,9 +11,8 @@ from ..parallel_map import T, parallel_map
 from .frame_likelihood import N_FIELDS, FrameLikelihood, frame_likelihood
 from .grasped_frames import ClosedFrame
 from .linear import NormalEquations, WeightedResiduals, misfit, normal_equations
-from .normal_equations import less_offset
+from .normal_equations import pull_sum, tool_sum
 from .problem import Point, Problem
-from .tool_pull import pull_products
 
 N_DIRECTIONS = 16
 """Number of parameters that most fits pad to, so that one compilation serves them."""
@@ -78,16 +77,12 @@ def residual(problem: Problem, weights: dict[int, FrameLikelihood], point: Point
 
 def misfit_of(problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals]) -> float:
     """Return weighted squared residuals [nat, doubled], with the smooth force fields eliminated grasp by grasp."""
-    total = 0.0
+    total = tool_sum(problem, every) / problem.scales.tool
+    if problem.scales.pull is not None:
+        total += pull_sum(problem, every) / problem.scales.pull
     for frames in problem.by_part(weights).values():
-        tool = np.array([np.asarray(every[k].tool)[:, None] for k in frames])
         precision, fields = field_information(problem, weights, every, frames)
         total += sum(float(every[k].squared) for k in frames)
-        total += less_offset(tool, problem.history.frames[frames[0]].frame)[0, 0] / problem.scales.tool
-        if problem.scales.pull is not None and problem.with_force(frames):
-            pulls = np.array([np.asarray(every[k].pull)[:, None] for k in frames])
-            closed = [problem.history.frames[k].frame for k in frames]
-            total += pull_products(pulls, closed)[0, 0] / problem.scales.pull
         total -= fields @ np.linalg.solve(precision, fields)
     return float(total)
 

@@ -15,6 +15,7 @@ from .gauss_newton import (
     Fitted,
     better_point,
     candidate_steps,
+    evaluated,
     fit_at,
     gauss_newton,
     linearise_at,
@@ -22,7 +23,6 @@ from .gauss_newton import (
     promised_log_posterior,
     start,
     weigh,
-    weighed_with,
 )
 from .likeliest_scales import with_likeliest_scales
 from .problem import Point, Problem
@@ -89,7 +89,7 @@ def _with_likeliest_scales(now: Fitted, log: Callable[[str], None] = lambda _: N
     """Return a fit's point under its likeliest scales."""
     at = with_likeliest_scales(now)
     log(f"variances {', '.join(f'{value:.3g}' for value in at.problem.scales.values)} of the assumed ones")
-    return linearised_fit(at, now.named)
+    return fit_at(at, now.named, now.equations) if at.weights is now.weights else linearised_fit(at, now.named)
 
 
 def without(fitted: Fitted, part: int) -> Fitted:
@@ -99,7 +99,8 @@ def without(fitted: Fitted, part: int) -> Fitted:
     at random.
     """
     kept = [k for k in fitted.equations if fitted.problem.history.frames[k].part != part]
-    at = weighed_with(fitted.problem, fitted.point, {k: fitted.weights[k] for k in kept})
+    weights, residuals = {k: fitted.weights[k] for k in kept}, {k: fitted.residuals[k] for k in kept}
+    at = evaluated(fitted.problem, fitted.point, weights, residuals)
     now = fit_at(at, fitted.named, {k: fitted.equations[k] for k in kept})
     better = better_point(now, candidate_steps(now, likeliest_set=False))
     return now if better is None else replace(now, point=better.point, log_likelihood=better.log_likelihood)

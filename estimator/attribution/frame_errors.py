@@ -4,6 +4,7 @@ With the terms of `likelihood_slope`, the noise n_y of the positions, the amplit
 smooth force fields are normal given the frames, and the force error is f = H (y - h(x) + F a - n_y) + r + Q c.
 """
 
+from collections.abc import Iterable
 from functools import partial
 
 import equinox as eqx
@@ -44,12 +45,12 @@ class FrameErrors(eqx.Module):
 
 
 class ForceErrors(eqx.Module):
-    """What a frame says of the size of the model's force errors, a part of all errors of its forces."""
+    """What frames say of the size of the model's force errors, a part of all errors of their forces."""
 
     squared: Float[Array, ""]
     """Sum of the squares of the mean errors, each over its variance."""
     degrees: Float[Array, ""]
-    """Number of errors that the frame determines: their number less what is left of their variances."""
+    """Number of errors that the frames determine: their number less what is left of their variances."""
     count: Float[Array, ""]
     """Their number; one that is a part of an error counts as that part."""
 
@@ -67,6 +68,11 @@ class ForceErrors(eqx.Module):
         squared = share * weight * jnp.sum(f[:, :, 0] ** 2, axis=1)
         degrees = jnp.sum(share * (3 - weight * left))
         return cls(squared=jnp.sum(squared), degrees=degrees, count=3 * jnp.sum(share))
+
+    @staticmethod
+    def together(frames: Iterable["ForceErrors"]) -> "ForceErrors":
+        """Return what several frames say."""
+        return jax.tree.map(lambda *each: sum(each[1:], each[0]), *frames)
 
 
 def field_amplitudes(at: Weighed) -> dict[int, FieldAmplitudes]:
@@ -98,15 +104,15 @@ def frame_errors(
     return FrameErrors(positions=seen - explained, amplitudes=c, position_covariance=inverse_band(frame.factor))
 
 
-def force_errors(at: Weighed) -> dict[int, ForceErrors]:
-    """Return what each frame of a point says of the size of its force errors."""
+def force_errors(at: Weighed) -> ForceErrors:
+    """Return what all frames of a point say of the size of their force errors."""
     amplitudes, noise = field_amplitudes(at), jnp.asarray(at.problem.noise)
 
     def one(k: int, frame: ClosedFrame, *_: object) -> ForceErrors:
         found = _force_errors(at.weights[k], seen_noise(frame, noise), at.residuals[k].forces, amplitudes[k])
         return jax.block_until_ready(found)
 
-    return each_frame(at.problem, at.point, at.weights, one)
+    return ForceErrors.together(each_frame(at.problem, at.point, at.weights, one).values())
 
 
 @eqx.filter_jit

@@ -155,11 +155,7 @@ def improved(
 
 def weigh(problem: Problem, point: Point, frames: list[int]) -> Weighed:
     """Return a point with the weights of some frames there."""
-    return weighed_with(problem, point, weighed(problem, point, frames))
-
-
-def weighed_with(problem: Problem, point: Point, weights: dict[int, FrameLikelihood]) -> Weighed:
-    """Return a point with the weights that it has."""
+    weights = weighed(problem, point, frames)
     return evaluated(problem, point, weights, residual(problem, weights, point))
 
 

@@ -9,7 +9,7 @@ with f the mean errors in units of the assumed ones, and the number of errors th
 doi:10.1162/neco.1992.4.3.415]. Both change with v, so that this is repeated; from the second time on by a secant.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -48,7 +48,7 @@ def with_likeliest_scales(at: Weighed) -> Weighed:
     """
     at, before = with_likeliest_others(at), None
     for _ in range(MAX_CHANGES):
-        place, errors = float(np.log(at.problem.scales.force)), list(force_errors(at).values())
+        place, errors = float(np.log(at.problem.scales.force)), force_errors(at)
         step, slope = likelier_force(at.problem, errors) - place, force_slope(at.problem, errors)
         least = determined(errors)
         if not 0.5 * slope * step / least > SETTLED:
@@ -63,27 +63,25 @@ def with_likeliest_scales(at: Weighed) -> Weighed:
     return at
 
 
-def likelier_force(problem: Problem, errors: Iterable[ForceErrors]) -> float:
+def likelier_force(problem: Problem, errors: ForceErrors) -> float:
     """Return the logarithm of a likelier variance of force errors, over the assumed one, from what all frames say."""
-    squared, degrees = np.sum([(float(one.squared), float(one.degrees)) for one in errors], axis=0)
-    return float(np.log(_likeliest(squared * problem.scales.force, degrees)))
+    return float(np.log(_likeliest(float(errors.squared) * problem.scales.force, float(errors.degrees))))
 
 
-def force_slope(problem: Problem, errors: Iterable[ForceErrors]) -> float:
+def force_slope(problem: Problem, errors: ForceErrors) -> float:
     """Return the slope of the log posterior by the logarithm of the variance of force errors [nat]."""
-    of_likelihood = 0.5 * sum(float(one.squared - one.degrees) for one in errors)
+    of_likelihood = 0.5 * float(errors.squared - errors.degrees)
     above, below = (log_prior(problem.scales.force * float(np.exp(change))) for change in (PRIOR_STEP, -PRIOR_STEP))
     return of_likelihood + (above - below) / (2 * PRIOR_STEP)
 
 
-def determined(errors: Iterable[ForceErrors]) -> float:
+def determined(errors: ForceErrors) -> float:
     """Return the share of all force errors that the frames determine.
 
     It is the least curvature of the log likelihood by the logarithm of their variance, over that of as many errors that
     are known exactly.
     """
-    degrees, count = np.sum([(float(one.degrees), float(one.count)) for one in errors], axis=0)
-    return max(float(degrees / count), MIN_DETERMINED)
+    return max(float(errors.degrees / errors.count), MIN_DETERMINED)
 
 
 def with_force(at: Weighed, log_force: float) -> Weighed:

@@ -36,9 +36,9 @@ from .frame_errors import FieldAmplitudes, ForceErrors, field_amplitudes, frame_
 from .frame_likelihood import FrameLikelihood, around, seen_noise
 from .gauss_newton import Fitted, Weighed
 from .grasped_frames import ClosedFrame
-from .normal_equations import less_offset
+from .normal_equations import tool_products
 from .sheet import PredictedSheet, gripped_forces
-from .tool_pull import adjoint, pull_products
+from .tool_pull import adjoint
 
 
 class FrameSlope(NamedTuple):
@@ -69,15 +69,10 @@ def likelihood_slopes(at: Weighed) -> dict[int, FrameSlope]:
 
 def whole_slope(fitted: Fitted, of_frames: dict[int, FrameSlope]) -> Float[np.ndarray, " k"]:
     """Return the slope of -ln likelihood by s and the free parameters, the tool and its force included [nat]."""
-    problem, equations, n, d = fitted.problem, fitted.equations, len(fitted.point.s), len(fitted.free)
+    problem, equations = fitted.problem, fitted.equations
     total = np.sum([np.append(one.of_s, one.of_theta[fitted.free]) for one in of_frames.values()], axis=0)
     for frames in problem.by_part(equations).values():
-        closed = [problem.history.frames[k].frame for k in frames]
-        rows = np.array([np.asarray(equations[k].tool) for k in frames])
-        total[n:] += less_offset(rows, closed[0])[:d, -1] / problem.scales.tool
-        if problem.scales.pull is not None and problem.with_force(frames):
-            pulls = np.array([np.asarray(equations[k].pull) for k in frames])
-            total += pull_products(pulls, closed)[: n + d, -1] / problem.scales.pull
+        total += tool_products(problem, equations, frames)[: len(total), -1]
     return total
 
 

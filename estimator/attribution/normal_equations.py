@@ -19,17 +19,29 @@ def reduced(problem: Problem, equations: dict[int, NormalEquations], d: int) -> 
     total: np.ndarray | float = 0.0
     for frames in problem.by_part(equations).values():
         whole = np.sum([np.asarray(equations[k].square) for k in frames], axis=0)
-        rows = np.array([np.asarray(equations[k].tool) for k in frames])
-        n = len(whole) - rows.shape[2]
-        whole[n:, n:] += less_offset(rows, problem.history.frames[frames[0]].frame) / problem.scales.tool
-        if problem.scales.pull is not None and problem.with_force(frames):
-            pulls = np.array([np.asarray(equations[k].pull) for k in frames])
-            whole += pull_products(pulls, [problem.history.frames[k].frame for k in frames]) / problem.scales.pull
+        whole = whole + tool_products(problem, equations, frames)
+        n = len(whole) - equations[frames[0]].tool.shape[1]
         left = np.r_[0 : n + d, len(whole) - 1]
         middle = whole[FIELDS, FIELDS] + np.eye(N_FIELDS) / problem.amplitude**2
         beside = whole[FIELDS][:, left]
         total = total + whole[np.ix_(left, left)] - beside.T @ np.linalg.solve(middle, beside)
     return np.asarray(total)
+
+
+def tool_products(
+    problem: Problem, equations: dict[int, NormalEquations], frames: list[int]
+) -> Float[np.ndarray, "k k"]:
+    """Return the part that the residuals of the tool and of its force have in the normal equations of a grasp."""
+    closed = [problem.history.frames[k].frame for k in frames]
+    rows = np.array([np.asarray(equations[k].tool) for k in frames])
+    size = len(equations[frames[0]].square)
+    n = size - rows.shape[2]
+    total = np.zeros((size, size))
+    total[n:, n:] = less_offset(rows, closed[0]) / problem.scales.tool
+    if problem.scales.pull is not None and problem.with_force(frames):
+        pulls = np.array([np.asarray(equations[k].pull) for k in frames])
+        total += pull_products(pulls, closed) / problem.scales.pull
+    return total
 
 
 def tool_sum(problem: Problem, residuals: dict[int, WeightedResiduals]) -> float:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from .frame_errors import ForceErrors
 from .gauss_newton import MAX_CHANGE, MIN_GAIN, Fitted, Step, Weighed, after_step, applied, cost, improved
 from .likeliest_scales import likelier_force, with_likeliest_others
 from .likelihood_slope import likelihood_slopes, whole_slope
@@ -22,7 +23,7 @@ MIN_PROMISE = 10.0
 MAX_LENGTHS = 3
 """Largest number of lengths of a step that are tried."""
 MIN_INFORMATION = 0.5
-"""Information about each s that is assumed at least: no frame may show an attachment."""
+"""Information that is added about each ln s / (1 - s): no frame may show an attachment."""
 MAX_LOG_CHANGE = 0.7
 """Largest change of ln s / (1 - s) in one step."""
 SHARES = (0.1, 0.5)
@@ -81,12 +82,9 @@ def _slope(now: Fitted) -> _Slope:
     hessian[range(n), range(n)] += of_determinants**2 / (3 * len(now.equations))
     hessian[range(n, n + len(sd)), range(n, n + len(sd))] += sd**-2
     slope[n:] += point.theta[now.free] / sd**2
-    force = np.exp(likelier_force(now.problem, (one.force_errors for one in of_frames.values())))
-    return _Slope(
-        slope=slope,
-        hessian=hessian,
-        scales=replace(now.problem.scales, force=float(force)),
-    )
+    errors = ForceErrors.together(one.force_errors for one in of_frames.values())
+    force = float(np.exp(likelier_force(now.problem, errors)))
+    return _Slope(slope=slope, hessian=hessian, scales=replace(now.problem.scales, force=force))
 
 
 def _step(now: Fitted, at: _Slope) -> tuple[Step, float]:

@@ -23,12 +23,12 @@ from ..effects.effect import Effect
 from .every_frame import directions, linearised, misfit_under
 from .gauss_newton import (
     Fitted,
+    evaluated,
     fit_at,
     gauss_newton,
     linearise_at,
     moved,
     promised_log_posterior,
-    weighed_with,
 )
 from .normal_equations import reduced, without_stiffnesses
 from .problem import Point
@@ -89,7 +89,8 @@ def _with_usual_tool(fitted: Fitted) -> Fitted:
     if scales == last:
         return fitted
     problem = fitted.problem.with_scales(scales)
-    return fit_at(weighed_with(problem, fitted.point, fitted.weights), fitted.named, fitted.equations)
+    at = evaluated(problem, fitted.point, fitted.weights, fitted.residuals)
+    return fit_at(at, fitted.named, fitted.equations)
 
 
 def parameters_sd(fitted: Fitted) -> Float[np.ndarray, " named"]:

@@ -86,17 +86,17 @@ def test_a_step_that_fails_as_a_whole_is_shortened(light, monkeypatch):
     """Where the first two points that are tried are no better, the third is on the way to the first."""
     fitted = light[0].declared.fits.assumed
     problem, frames, free = fitted.problem, list(fitted.equations), np.zeros_like(fitted.point.s)
-    tried, real = [], stepping.weighed_with
+    tried, real = [], stepping.evaluated
 
-    def refusing(problem, point, weights):
+    def refusing(problem, point, weights, residuals):
         tried.append(point)
-        there = real(problem, point, weights)
+        there = real(problem, point, weights, residuals)
         return there if len(tried) > stepping.MAX_WHOLE else dataclasses.replace(there, log_likelihood=-np.inf)
 
     with jax.enable_x64(True), one_thread():
         point = stepping.start(problem, fitted.point.theta, free, fitted.point.states, frames)
         begun = stepping.linearise_at(problem, fitted.named, point, frames)
-        monkeypatch.setattr(stepping, "weighed_with", refusing)
+        monkeypatch.setattr(stepping, "evaluated", refusing)
         better = stepping.better_point(begun, stepping.candidate_steps(begun))
     assert better is not None and len(tried) == stepping.MAX_WHOLE + 1
     np.testing.assert_allclose(better.point.s, stepping.SHORTER_SHARES[0] * tried[0].s, atol=1e-12)
