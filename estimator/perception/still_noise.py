@@ -2,10 +2,10 @@
 
 It is white noise on each point, and a smooth field over the sheet,
 
-    cov(n_i, n_j) = sd^2 [i = j] + smooth_sd^2 exp(-|a_i - a_j|^2 / 2 length^2)
+    cov(n_i, n_j) = sd^2 [i = j] + smooth_sd^2 exp(-(|a_i - a_j| / length)^p / p)
 
-the same for each coordinate. It is measured from differences of consecutive frames, so that drifts and jumps do not
-count; and never from the residual of a fit, which holds the effects that are searched for.
+the same for each coordinate, with p = 2 where it is measured. It is measured from differences of consecutive frames, so
+that drifts and jumps do not count; and never from the residual of a fit, which holds the effects that are searched for.
 """
 
 import math
@@ -58,6 +58,8 @@ class StillNoise:
     """Range of the smooth part [m]."""
     frames: int
     """Number of still frames; 0 if the noise is assumed."""
+    exponent: float = 2.0
+    """p of the smooth part's covariance: 2 for one range alone, 1 for all ranges down from `length`."""
 
     @property
     def total_sd(self) -> float:
@@ -65,22 +67,23 @@ class StillNoise:
         return float(np.hypot(self.sd, self.smooth_sd))
 
     def fields(
-        self, rest: Float[np.ndarray, "n 3"], measured: Bool[np.ndarray, " n"] | None = None
+        self, rest: Float[np.ndarray, "n 3"], measured: Bool[np.ndarray, " n"] | None = None, *, every: bool = False
     ) -> tuple[Float[np.ndarray, "n modes"], float]:
         """Return the smooth part as fields of unit amplitude [m], and the sd of the rest, white part included [m].
 
         Args:
             rest: rest positions of all particles [m].
             measured: particles at which anything is measured, all if None; the fields are 0 at the others.
+            every: whether fields of less than `MIN_MODE_VARIANCE` are kept, as positions may drift along them.
         """
         measured = np.ones(len(rest), dtype=bool) if measured is None else measured
         if not self.smooth_sd or not measured.any():
             return np.zeros((len(rest), 0)), self.total_sd
-        modes = smooth_modes(rest[measured], self.length, MAX_MODES)
+        modes = smooth_modes(rest[measured], self.length, MAX_MODES, exponent=self.exponent)
         values = np.sum(modes**2, axis=0)
         enough = int(np.searchsorted(np.cumsum(values), KEPT_VARIANCE * len(modes))) + 1
         matter = int(np.sum(values * self.smooth_sd**2 > MIN_MODE_VARIANCE * self.sd**2))
-        m = min(enough, matter, len(values))
+        m = min(enough, len(values) if every else matter, len(values))
         rest_share = max(0.0, 1 - values[:m].sum() / len(modes))
         fields = np.zeros((len(rest), -(-m // MODE_MULTIPLE) * MODE_MULTIPLE))
         fields[measured, :m] = self.smooth_sd * modes[:, :m]
