@@ -125,7 +125,9 @@ def close_the_loop(
         sds=np.maximum(parameters_sd(last.fitted), jackknife_sd(thetas, len(last.fitted.named))),
         reported=(predicted[0], predicted[-1]) if predicted else None,
         remainder=left,
-        with_remainder=None if spare is None else predicted[-1].beyond(*left.of(problem.history.frames, spare)),
+        with_remainder=None
+        if spare is None
+        else predict_held_out(last.fitted, spare, drift=False).beyond(*left.of(problem.history.frames, spare)),
         problem=problem,
     )
 

@@ -24,10 +24,14 @@ from .held_shape import another_shape
 from .tool_pull import frame_pulls
 
 ASSUMED_SD = 2e-4
-"""Standard deviation of the white and of the smooth noise each, where neither still frames nor the recording give it
-[m]."""
+"""Standard deviation of the white noise, where neither still frames nor the recording give it [m]."""
+ASSUMED_SHARE = 0.2
+"""Standard deviation of the smooth noise that is new in each frame, over that of the white noise, where there are no
+still frames. What neighbours share stays for the most part, as a drift. Of 0.2 and 1, the likelier on `skin_1013`."""
 ASSUMED_LENGTH = 1.2e-2
 """Range of the smooth noise where there are no still frames [m]."""
+ASSUMED_EXPONENT = 1.0
+"""Exponent of its covariance, which has power at all shorter ranges too: how far a tracker errs alike is not known."""
 MAX_RESTING_DISPLACEMENT = 1e-3
 """Reported displacement of the tool since the jaws closed up to which the sheet counts as still [m]."""
 OPEN_ALONE = "the force of the tool was measured with open jaws alone, where nothing pulls."
@@ -124,7 +128,7 @@ def collect_dataset(
         ]
     noise = _noise_of([still], estimator) or _noise_of(list(resting.values()), estimator) or noise
     measured = None if estimator.track_ids is None else estimator.track_ids >= 0
-    fields, sd = noise.fields(estimator.sheet.rest, measured)
+    fields, sd = noise.fields(estimator.sheet.rest, measured, every=noise.frames == 0)
     mistaken = another_shape(frames, sd, fields)
     stiffness = estimator.declaration.membrane_stiffness
     return Dataset(
@@ -139,12 +143,12 @@ def collect_dataset(
 
 
 def assumed(sd: float) -> StillNoise:
-    """Return the noise assumed where there are too few still frames: the stated sd [m], and as much smooth noise."""
-    return StillNoise(sd=sd, smooth_sd=sd, length=ASSUMED_LENGTH, frames=0)
+    """Return the noise assumed where there are too few still frames: the stated sd [m], and a share of smooth noise."""
+    return StillNoise(sd=sd, smooth_sd=ASSUMED_SHARE * sd, length=ASSUMED_LENGTH, frames=0, exponent=ASSUMED_EXPONENT)
 
 
 def stated(points: MeasuredPoints) -> StillNoise:
-    """Return the noise that points state; where they state no smooth noise, as much of it as of all is assumed."""
+    """Return the noise that points state; where they state no smooth noise, a share of it is assumed."""
     if points.smooth_length is None:
         return assumed(points.sd)
     white = np.sqrt(points.sd**2 - points.smooth_sd**2)

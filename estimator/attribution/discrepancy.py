@@ -56,6 +56,8 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
             "smooth_sd_m": noise.smooth_sd,
             "smooth_length_m": noise.length,
             "still_frames": noise.frames,
+            "tracker_walk_m": closed.final.fitted.problem.walk_step,
+            "tracker_drift_m": closed.final.fitted.problem.drift_sd,
         },
         "frames": {"used": len(dataset.frames), "left_out": list(dataset.left_out)},
         "localisation": before,
@@ -102,7 +104,13 @@ def _probability(one: Hypothesis, probability: float) -> dict[str, Any]:
         "probability": probability,
         "log_evidence": one.log_evidence,
         "frames": len(one.fitted.equations),
-        "variances": {"force": scales.force, "fields": scales.fields, "tool": scales.tool, "pull": scales.pull},
+        "variances": {
+            "force": scales.force,
+            "fields": scales.fields,
+            "tool": scales.tool,
+            "walk": scales.walk,
+            "pull": scales.pull,
+        },
         "larger_errors": scales.larger,
     }
 

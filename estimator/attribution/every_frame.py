@@ -8,10 +8,10 @@ from jaxtyping import Array, Float
 
 from ..effects.sheet_model import FrameContext
 from ..parallel_map import T, parallel_map
-from .frame_likelihood import N_FIELDS, FrameLikelihood, frame_likelihood
+from .frame_likelihood import FrameLikelihood, frame_likelihood
 from .grasped_frames import ClosedFrame
 from .linear import NormalEquations, WeightedResiduals, misfit, normal_equations
-from .normal_equations import pull_sum, tool_sum
+from .normal_equations import Common, common, pull_sum, tool_sum
 from .problem import Point, Problem
 
 N_DIRECTIONS = 16
@@ -49,18 +49,15 @@ def linearised(
 
 def misfit_under(problem: Problem, weights: dict[int, FrameLikelihood], point: Point) -> float:
     """Return the weighted squared residuals of a point's predictions [nat, doubled], under weights of another point."""
-    return misfit_of(problem, weights, residual(problem, weights, point))
+    every = residual(problem, weights, point)
+    return misfit_of(problem, every, in_common(problem, weights, every))
 
 
-def log_determinants(problem: Problem, weights: dict[int, FrameLikelihood]) -> float:
-    """Return the log determinant of all observations' covariance, the smooth fields and the tool included [nat]."""
-    total = 3 * len(weights) * float(np.log(problem.scales.tool))
+def log_determinants(problem: Problem, weights: dict[int, FrameLikelihood], grasps: Iterable[Common]) -> float:
+    """Return the log determinant of all observations' covariance, what frames share and the tool included [nat]."""
+    total = 3 * len(weights) * float(np.log(problem.scales.tool)) + sum(one.log_det for one in grasps)
     if problem.scales.pull is not None:
         total += 3 * problem.with_force(weights) * float(np.log(problem.scales.pull))
-    for frames in problem.by_part(weights).values():
-        among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
-        with np.errstate(invalid="ignore"):  # where a point has no finite weights, the caller refuses it
-            total += float(np.linalg.slogdet(np.eye(N_FIELDS) + problem.amplitude**2 * among)[1])
     every = parallel_map(lambda k: float(weights[k].log_determinant()), weights)
     return total + sum(every.values())
 
@@ -75,28 +72,19 @@ def residual(problem: Problem, weights: dict[int, FrameLikelihood], point: Point
     return each_frame(problem, point, weights, one)
 
 
-def misfit_of(problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals]) -> float:
-    """Return weighted squared residuals [nat, doubled], with the smooth force fields eliminated grasp by grasp."""
+def in_common(
+    problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals]
+) -> list[Common]:
+    """Return what the residuals of each grasp's frames say of what these have in common."""
+    return [common(problem, weights, every, frames) for frames in problem.by_grasp(weights).values()]
+
+
+def misfit_of(problem: Problem, every: dict[int, WeightedResiduals], grasps: Iterable[Common]) -> float:
+    """Return weighted squared residuals [nat, doubled], with what the frames of a grasp have in common eliminated."""
     total = tool_sum(problem, every) / problem.scales.tool
     if problem.scales.pull is not None:
         total += pull_sum(problem, every) / problem.scales.pull
-    for frames in problem.by_part(weights).values():
-        precision, fields = field_information(problem, weights, every, frames)
-        total += sum(float(every[k].squared) for k in frames)
-        total -= fields @ np.linalg.solve(precision, fields)
-    return float(total)
-
-
-def field_information(
-    problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, WeightedResiduals], frames: list[int]
-) -> tuple[Float[np.ndarray, "q q"], Float[np.ndarray, " q"]]:
-    """Return the precision of the amplitudes c of a grasp's smooth force fields, and their products with the residuals.
-
-    The likeliest c are minus the products, over the precision.
-    """
-    among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
-    products = np.sum([np.asarray(every[k].fields) for k in frames], axis=0)
-    return among + np.eye(N_FIELDS) / problem.amplitude**2, products
+    return float(total + sum(one.misfit for one in grasps))
 
 
 def each_frame(

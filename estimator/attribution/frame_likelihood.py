@@ -3,15 +3,16 @@
 Let e = H (y - h(x)), with x the predicted equilibrium. Let N be the covariance of the model's force errors and of the
 noise of observed positions, mapped to forces by H. Then
 
-    e + H F a + Q c = n,    n ~ N(0, N),  a ~ N(0, I),  c ~ N(0, amplitude^2 I)
+    e + H F (a + w) + Q c = n,    n ~ N(0, N),  a ~ N(0, I),  c ~ N(0, amplitude^2 I)
 
-with F the smooth fields of the noise, independent in every frame, and Q smooth force fields that stand for any other
-error of the model and are the same in all frames of a grasp. So the log density of the positions is, for c = 0,
+with F the smooth fields of the noise, independent in every frame, w a random walk from frame to frame of the grasp
+(`tracker_walk`), and Q smooth force fields that stand for any other error of the model and are the same in all frames
+of a grasp. So the log density of the positions is, for c = w = 0,
 
     -1/2 [e^T (N + H F F^T H^T)^-1 e + ln |N + H F F^T H^T| - 2 ln |H|]
 
-up to a constant. A model that yields more has a wider density, so a comparison of models needs both determinants. c is
-eliminated grasp by grasp (`every_frame.misfit_of`).
+up to a constant. A model that yields more has a wider density, so a comparison of models needs both determinants. w and
+c are eliminated grasp by grasp (`normal_equations.common`).
 """
 
 from dataclasses import replace
@@ -59,8 +60,8 @@ class FrameLikelihood(eqx.Module):
     """Smooth force fields Q."""
     white: Float[Array, "n 3 q"]
     """Smooth force fields, whitened: N^-1 Q."""
-    among: Float[Array, "q q"]
-    """Inner products of the fields: Q^T (N + H F F^T H^T)^-1 Q."""
+    among: Float[Array, "k k"]
+    """Inner products under (N + H F F^T H^T)^-1 of the columns that frames have in common, Q and H F."""
     log_square: Float[Array, ""]
     """ln |H^T H| over the particles with a force equation."""
     adjoint: Float[Array, "n 3 3"] | None = None
@@ -73,6 +74,15 @@ class FrameLikelihood(eqx.Module):
         a, b = (jnp.einsum("nic,nik->ck", self.noise, side) for side in (left, right))
         solved = jax.scipy.linalg.cho_solve((self.spread, True), b)
         return jnp.einsum("nil,nir->lr", left, white) - a.T @ solved
+
+    def shift_products(self, columns: Float[Array, "n 3 k"]) -> Float[Array, "c k"]:
+        """Return (H F)^T (N + H F F^T H^T)^-1 columns."""
+        return jax.scipy.linalg.cho_solve((self.spread, True), jnp.einsum("nic,nik->ck", self.noise, columns))
+
+    def shift_square(self) -> Float[Array, "c c"]:
+        """Return (H F)^T (N + H F F^T H^T)^-1 H F."""
+        eye = jnp.eye(len(self.spread))
+        return eye - jax.scipy.linalg.cho_solve((self.spread, True), eye)
 
     def whitened(self, columns: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
         """Return N^-1 times each column."""
@@ -190,10 +200,12 @@ def _likelihood(
         spread=jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white)),
         fields=fields,
         white=each(partial(balance.whitened, linear), fields),
-        among=jnp.zeros((N_FIELDS, N_FIELDS)),
+        among=jnp.zeros((0, 0)),
         log_square=jnp.zeros(()),
     )
-    return eqx.tree_at(lambda one: one.among, likelihood, likelihood.dot(fields, fields, likelihood.white))
+    of_fields, beside = likelihood.dot(fields, fields, likelihood.white), likelihood.shift_products(fields)
+    among = jnp.block([[of_fields, beside.T], [beside, likelihood.shift_square()]])
+    return eqx.tree_at(lambda one: one.among, likelihood, among)
 
 
 @eqx.filter_jit

@@ -16,7 +16,7 @@ from ..belief.attachment_belief import AttachmentBelief
 from ..belief.gaussian_information import GaussianInformation
 from ..filters.implicit import likeliest, quick_summary
 from ..filters.posterior_summary import PosteriorSummary
-from .every_frame import directions, linearised, log_determinants, misfit_of, residual, weighed
+from .every_frame import directions, in_common, linearised, log_determinants, misfit_of, residual, weighed
 from .frame_likelihood import FrameLikelihood
 from .linear import NormalEquations, WeightedResiduals
 from .noise_scales import NoiseScales
@@ -163,7 +163,8 @@ def evaluated(
     problem: Problem, point: Point, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
 ) -> Weighed:
     """Return a weighed point with its likelihood under a problem's scales of the fields and of the tool."""
-    doubled = misfit_of(problem, weights, residuals) + log_determinants(problem, weights)
+    grasps = in_common(problem, weights, residuals)
+    doubled = misfit_of(problem, residuals, grasps) + log_determinants(problem, weights, grasps)
     return Weighed(problem=problem, point=point, weights=weights, residuals=residuals, log_likelihood=-0.5 * doubled)
 
 

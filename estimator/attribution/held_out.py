@@ -1,18 +1,23 @@
-"""Held-out prediction: predict frames that a fit never saw, from the tool's reports alone."""
+"""Held-out prediction: predict frames that a fit never saw, from the tool's reports alone.
+
+Where other frames of the same grasp were fitted, the tracker's drift goes on from what is known of it there.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.stats import norm
 
 from ..belief.gaussian_information import GaussianInformation
+from ..filters.smooth_noise import each
 from ..parallel_map import parallel_map
 from .every_frame import directions, weighed
-from .frame_likelihood import FrameLikelihood
+from .frame_errors import CommonAmplitudes, common_amplitudes
+from .frame_likelihood import N_FIELDS, FrameLikelihood, seen_noise
 from .gauss_newton import Fitted
 from .grasped_frames import ClosedFrame
 from .linear import parameter_forces
@@ -32,8 +37,8 @@ class Variances:
     fit: Float[np.ndarray, "m 3"]
     """Variance by what the fit leaves open of the stiffnesses and the parameters."""
     others: Float[np.ndarray, "m 3"]
-    """Variance by force errors of the model, its smooth fields and the noise of observed positions, of the sizes that
-    were fitted; or by the remainder instead."""
+    """Variance by force errors of the model, its smooth fields, the noise of observed positions and the tracker's walk,
+    of the sizes that were fitted; or by the remainder instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,17 +99,32 @@ def held_out(fits: dict[int, Fitted]) -> list[HeldOut]:
     return list(parallel_map(lambda part: predict_held_out(fits[part], part), fits).values())
 
 
-def predict_held_out(fitted: Fitted, part: int) -> HeldOut:
-    """Return the prediction of one part that was not fitted to."""
+def predict_held_out(fitted: Fitted, part: int, *, drift: bool = True) -> HeldOut:
+    """Return the prediction of one part that was not fitted to.
+
+    Args:
+        fitted: the fit.
+        part: number of the part.
+        drift: whether what is known of the tracker's drift is in it.
+    """
     problem = fitted.problem
     frames = problem.frames({part})
     predicted, closed = from_rest(problem, fitted.point, frames, by_tool=True), problem.history.frames
+    walks = common_amplitudes(fitted, frames)
+
+    @cache
+    def weights() -> dict[int, FrameLikelihood]:
+        return weighed(problem, predicted, frames)
+
+    def shifted(k: int) -> Float[np.ndarray, "m 3"]:
+        shift = shifts(problem, weights()[k], k) @ np.asarray(walks[k].mean)[N_FIELDS:]
+        return shift.reshape(-1, 3)[np.asarray(closed[k].frame.counted)]
 
     def variances() -> Variances:
-        weights, known = weighed(problem, predicted, frames), _covariance(fitted)
+        known = _covariance(fitted)
 
         def one(k: int) -> Variances:
-            return _variances(fitted, predicted, weights[k], k, known)
+            return _variances(fitted, predicted, weights()[k], k, known, walks[k])
 
         every = parallel_map(one, frames)
         counted = {k: np.asarray(closed[k].frame.counted) for k in frames}
@@ -113,7 +133,10 @@ def predict_held_out(fitted: Fitted, part: int) -> HeldOut:
             others=np.concatenate([every[k].others[counted[k]] for k in frames]),
         )
 
-    return HeldOut(residual=residuals(problem, predicted, frames), compute_variances=variances)
+    residual = residuals(problem, predicted, frames)
+    if drift and any(np.any(np.asarray(walks[k].mean)[N_FIELDS:]) for k in frames):
+        residual = residual + np.concatenate(list(parallel_map(shifted, frames).values()))
+    return HeldOut(residual=residual, compute_variances=variances)
 
 
 def noise_variance(problem: Problem, frame: ClosedFrame) -> Float[np.ndarray, " n"]:
@@ -161,15 +184,31 @@ def _covariance(fitted: Fitted) -> Float[np.ndarray, "k k"]:
 
 
 def _variances(
-    fitted: Fitted, predicted: Point, likelihood: FrameLikelihood, k: int, known: Float[np.ndarray, "k k"]
+    fitted: Fitted,
+    predicted: Point,
+    likelihood: FrameLikelihood,
+    k: int,
+    known: Float[np.ndarray, "k k"],
+    walk: CommonAmplitudes,
 ) -> Variances:
-    """Return the variances of each observed coordinate of frame k; `known` is the covariance of s and parameters."""
+    """Return the variances of each observed coordinate of frame k.
+
+    Args:
+        fitted: the fit.
+        predicted: the prediction.
+        likelihood: weights at the predicted state.
+        k: the frame.
+        known: covariance of s and parameters.
+        walk: what is known of the tracker's walk.
+    """
     problem, n = fitted.problem, len(likelihood.seen)
     by_force, by_fit = responses(fitted, predicted, likelihood, k)
     error = np.asarray(problem.sheet.balance.error(jnp.asarray(predicted.states[k])))
     fields = np.einsum("ani,nij->aj", by_force, np.asarray(likelihood.fields)) * problem.amplitude
     wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2)) + np.sum(fields**2, axis=1)
     unsure = np.sum((by_fit @ known) * by_fit, axis=1)
+    walked = shifts(problem, likelihood, k) @ np.asarray(walk.root)[N_FIELDS:]
+    wrong = wrong + np.sum(walked**2, axis=1)
     return Variances(
         fit=np.maximum(unsure, 0).reshape(n, 3),
         others=wrong.reshape(n, 3) + noise_variance(problem, problem.history.frames[k].frame)[:, None],
@@ -185,14 +224,7 @@ def responses(
     """
     problem, n = fitted.problem, len(likelihood.seen)
     closed, states = problem.history.frames[k].frame, jnp.asarray(predicted.states)
-    held = np.asarray(closed.held)
-    rows = np.zeros((n + 1, 3, n + 1, 3))
-    neighbours = np.asarray(likelihood.balance.neighbours)
-    slope = np.asarray(likelihood.frame.dr_dx)
-    rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(slope, 2, 3).swapaxes(2, 3)
-    H = rows[:n, :, :n].reshape(3 * n, 3 * n)
-    H[np.repeat(held, 3)] = 0.0
-    H[np.repeat(held, 3), np.repeat(held, 3)] = HELD_STIFFNESS
+    held, H = np.asarray(closed.held), _with_held_fixed(likelihood, np.asarray(closed.held))
     by_force = np.where(held[None, :, None], 0.0, np.linalg.inv(H).reshape(3 * n, n, 3))
     of_parameters = parameter_forces(
         problem.sheet,
@@ -205,3 +237,29 @@ def responses(
     by_s = np.einsum("ani,ni->an", by_force, np.asarray(likelihood.frame.dr_ds))
     by_theta = np.einsum("ani,nij->aj", by_force, np.asarray(of_parameters))
     return by_force, np.concatenate([by_s, by_theta], axis=1)
+
+
+def shifts(problem: Problem, likelihood: FrameLikelihood, k: int) -> Float[np.ndarray, "m c"]:
+    """Return by how much the predicted coordinates of frame k fall with each amplitude of the smooth noise [m].
+
+    What is held is where it is observed, so that it takes its neighbours with it as far as it is observed wrongly.
+    """
+    frame, balance = problem.history.frames[k].frame, likelihood.balance
+    seen = seen_noise(frame, jnp.asarray(problem.noise))
+    forces = np.array(each(partial(balance.apply, likelihood.frame.dr_dx), seen))
+    held = np.asarray(frame.held)
+    forces[held] = 0.0
+    return np.linalg.solve(_with_held_fixed(likelihood, held), forces.reshape(3 * len(forces), -1))
+
+
+def _with_held_fixed(likelihood: FrameLikelihood, held: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m m"]:
+    """Return H with the equations of what is held replaced by stiff springs."""
+    n = len(held)
+    rows = np.zeros((n + 1, 3, n + 1, 3))
+    neighbours = np.asarray(likelihood.balance.neighbours)
+    slope = np.asarray(likelihood.frame.dr_dx)
+    rows[np.arange(n)[:, None], :, neighbours] = np.moveaxis(slope, 2, 3).swapaxes(2, 3)
+    H = rows[:n, :, :n].reshape(3 * n, 3 * n)
+    H[np.repeat(held, 3)] = 0.0
+    H[np.repeat(held, 3), np.repeat(held, 3)] = HELD_STIFFNESS
+    return H

@@ -1,6 +1,6 @@
 """The noise scales that are likeliest at a fit's point.
 
-Those of the smooth fields, of the tool and of its force follow from the residuals that there are. The variance v of
+Those of the walk, the smooth fields, the tool and its force follow from the residuals that there are. The variance v of
 force errors changes the weights of all frames. At its maximum the likelihood has
 
     v = sum |f|^2 / degrees,
@@ -17,9 +17,9 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from ..parallel_map import parallel_map
-from .every_frame import residual
+from .every_frame import in_common, residual
 from .frame_errors import ForceErrors, force_errors
-from .frame_likelihood import FrameLikelihood, with_force_sd
+from .frame_likelihood import N_FIELDS, FrameLikelihood, with_force_sd
 from .gauss_newton import Weighed, evaluated
 from .linear import WeightedResiduals
 from .noise_scales import log_prior
@@ -36,6 +36,8 @@ MIN_DETERMINED = 1e-3
 """Lower bound of the share of the force errors that the frames determine, by which steps are divided."""
 PRIOR_STEP = 1e-4
 """Change of the logarithm of a variance in the difference that is the slope of its prior."""
+WALK_TOLERANCE = 0.02
+"""Tolerance of the logarithm of the variance of the walk's steps, each value of which costs a pass over all frames."""
 LOG_RANGE = (-3.0, 14.0)
 """Range of the logarithms of all variances [nat]. Where a sheet was measured in one plane, or the tool is the mean of
 what it holds, some residuals are 0, and the likelihood would rise towards a variance of 0."""
@@ -101,6 +103,7 @@ def with_likeliest_others(at: Weighed) -> Weighed:
 def _with_likeliest_others(
     problem: Problem, point: Point, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
 ) -> Weighed:
+    problem = problem.with_scales(replace(problem.scales, walk=_likeliest_walk(problem, weights, residuals)))
     scales, with_force = problem.scales, problem.with_force(weights)
     scales = replace(
         scales,
@@ -111,15 +114,29 @@ def _with_likeliest_others(
     return evaluated(problem.with_scales(scales), point, weights, residuals)
 
 
+def _likeliest_walk(
+    problem: Problem, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
+) -> float:
+    """Return the likeliest variance of the steps of the tracker's walk, over the assumed one."""
+    if not problem.noise.size:
+        return problem.scales.walk
+
+    def log_likelihood(variance: float) -> float:
+        with_walk = problem.with_scales(replace(problem.scales, walk=variance))
+        return -0.5 * sum(one.misfit + one.log_det for one in in_common(with_walk, weights, residuals))
+
+    return _largest(log_likelihood, tolerance=WALK_TOLERANCE)
+
+
 def _likeliest_fields(
     problem: Problem, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
 ) -> float:
     """Return the likeliest variance of the smooth force fields, over the assumed one."""
     eigenvalues, along = [], []
-    for frames in problem.by_part(weights).values():
-        values, vectors = np.linalg.eigh(np.sum([np.asarray(weights[k].among) for k in frames], axis=0))
+    for one in in_common(problem, weights, residuals):
+        values, vectors = np.linalg.eigh(one.precision - np.eye(N_FIELDS) / problem.amplitude**2)
         eigenvalues.append(np.maximum(values, 0))
-        along.append((vectors.T @ np.sum([np.asarray(residuals[k].fields) for k in frames], axis=0)) ** 2)
+        along.append((vectors.T @ one.products) ** 2)
 
     def log_likelihood(variance: float) -> float:
         square = AMPLITUDE**2 * variance / problem.scales.force
@@ -134,10 +151,10 @@ def _likeliest(squared: float, degrees: float) -> float:
     return _largest(lambda variance: -0.5 * (squared / variance + degrees * float(np.log(variance))))
 
 
-def _largest(log_likelihood: Callable[[float], float]) -> float:
-    """Return the variance of largest posterior."""
+def _largest(log_likelihood: Callable[[float], float], tolerance: float = 1e-5) -> float:
+    """Return the variance of largest posterior, up to a tolerance of its logarithm."""
 
     def minus(log_variance: float) -> float:
         return -log_likelihood(float(np.exp(log_variance))) - log_prior(float(np.exp(log_variance)))
 
-    return float(np.exp(minimize_scalar(minus, bounds=LOG_RANGE, method="bounded").x))
+    return float(np.exp(minimize_scalar(minus, bounds=LOG_RANGE, method="bounded", options={"xatol": tolerance}).x))

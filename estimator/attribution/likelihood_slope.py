@@ -1,11 +1,12 @@
 """The slope of the whole log likelihood by the effects' parameters: that of residuals, weights and determinants.
 
-Given the noise n_y of the positions and the amplitudes a and c of the smooth noise and force fields, the force error is
+Given the noise n_y of the positions and the amplitudes a, w and c of the smooth noise, of the tracker's walk and of the
+smooth force fields, the force error is
 
-    f = H (y - h(x) + F a - n_y) + r + Q c,    f ~ N(0, T^2),
+    f = H (y - h(x) + F (a + w) - n_y) + r + Q c,    f ~ N(0, T^2),
 
 and the positions have no other error. So by Fisher's identity the slope of the marginal likelihood is the mean of that
-of this one, over what the frames say of n_y, a and c,
+of this one, over what the frames say of n_y, a, w and c,
 
     -d ln p(y) = d [E |f|^2 / T^2 + ln |T^2| - ln |H^T H|] / 2
 
@@ -32,7 +33,7 @@ from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
 from ..physics.block_tridiagonal import inverse_band, window_sums
 from .every_frame import each_frame
-from .frame_errors import FieldAmplitudes, ForceErrors, field_amplitudes, frame_errors
+from .frame_errors import CommonAmplitudes, ForceErrors, common_amplitudes, frame_errors
 from .frame_likelihood import FrameLikelihood, around, seen_noise
 from .gauss_newton import Fitted, Weighed
 from .grasped_frames import ClosedFrame
@@ -57,7 +58,7 @@ def likelihood_slopes(at: Weighed) -> dict[int, FrameSlope]:
 
     The residuals of the tool and of its force are not in it, as their weights do not change.
     """
-    theta, noise, amplitudes = jnp.asarray(at.point.theta), jnp.asarray(at.problem.noise), field_amplitudes(at)
+    theta, noise, amplitudes = jnp.asarray(at.point.theta), jnp.asarray(at.problem.noise), common_amplitudes(at)
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameSlope:
         e = at.residuals[k].forces
@@ -71,7 +72,7 @@ def whole_slope(fitted: Fitted, of_frames: dict[int, FrameSlope]) -> Float[np.nd
     """Return the slope of -ln likelihood by s and the free parameters, the tool and its force included [nat]."""
     problem, equations = fitted.problem, fitted.equations
     total = np.sum([np.append(one.of_s, one.of_theta[fitted.free]) for one in of_frames.values()], axis=0)
-    for frames in problem.by_part(equations).values():
+    for frames in problem.by_grasp(equations).values():
         total += tool_products(problem, equations, frames)[: len(total), -1]
     return total
 
@@ -86,14 +87,14 @@ def frame_slope(
     x: Float[Array, "n 3"],
     e: Float[Array, "n 3"],
     noise: Float[Array, "n modes"],
-    fields: FieldAmplitudes,
+    amplitudes: CommonAmplitudes,
 ) -> FrameSlope:
     """Return one frame's slope of -ln likelihood by s and theta at its predicted state x [nat].
 
     `e` are the forces H (y - h(x)) + r there [N], `noise` the smooth noise's fields [m].
     """
     s, known = likelihood.frame.s, likelihood.frame.weight > 0
-    errors = frame_errors(likelihood, seen_noise(frame, noise), e, fields)
+    errors = frame_errors(likelihood, seen_noise(frame, noise), e, amplitudes)
     of_square = inverse_band(likelihood.square_factor())
 
     def expected(theta: Float[Array, " p"], s: Float[Array, " n"], x: Float[Array, "n 3"]):

@@ -2,9 +2,9 @@
 
 With the terms of `frame_likelihood`, at the bounded stiffnesses s and the parameters theta,
 
-    e + r + D ds + G dtheta + Q c + H F a = n
+    e + r + D ds + G dtheta + Q c + H F (w + a) = n
 
-where r = 0 but for rounding. a is eliminated frame by frame, c grasp by grasp. At a noisy state instead of the
+where r = 0 but for rounding. a is eliminated frame by frame, w and c grasp by grasp. At a noisy state instead of the
 predicted one this would be an errors-in-variables problem, with false effects.
 """
 
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
-from .frame_likelihood import N_FIELDS, FrameLikelihood, seen_shift
+from .frame_likelihood import FrameLikelihood, seen_shift
 from .grasped_frames import ClosedFrame
 from .sheet import PredictedSheet, gripped_forces, tool_residual
 from .tool_pull import off_balance, predicted_pull
@@ -29,12 +29,12 @@ GRASP_SD = 5e-4
 
 
 class NormalEquations(eqx.Module):
-    """One frame's normal equations over s, then theta in given directions, then the fields Q, then -1 for e itself."""
+    """One frame's normal equations over s, then theta in given directions, then c, then w, then -1 for e itself."""
 
     square: Float[Array, "k k"]
-    """Normal equations, k = n + directions + fields + 1."""
+    """Normal equations, k = n + directions + fields + shifts + 1."""
     tool: Float[Array, "3 j"]
-    """Rows of the tool's residual, over theta, fields (zero) and e, in units of `tool_sd`."""
+    """Rows of the tool's residual, over theta, c and w (zero) and e, in units of `tool_sd`."""
     pull: Float[Array, "3 k"] | None = None
     """Rows of the residual of the tool's force, in units of its sd; None where no frame has a measured one."""
 
@@ -46,8 +46,8 @@ class WeightedResiduals(eqx.Module):
     """e itself [N]."""
     squared: Float[Array, ""]
     """Squared norm of e under the weights."""
-    fields: Float[Array, " q"]
-    """Inner products of the fields with e: Q^T N^-1 e."""
+    common: Float[Array, " k"]
+    """Inner products of e with the columns that frames have in common; see `FrameLikelihood.among`."""
     tool: Float[Array, " 3"]
     """Residual of the tool, in units of `tool_sd`."""
     pull: Float[Array, " 3"] | None = None
@@ -106,7 +106,8 @@ def misfit(
         off = jnp.where(frame.held[:, None], 0.0, unbalanced)
         predicted = predicted - jnp.einsum("nic,ni->c", likelihood.adjoint, off)
         pull = frame.pull.weight * (predicted - frame.pull.force)
-    return WeightedResiduals(forces=forces, squared=products[-1], fields=products[:-1], tool=tool, pull=pull)
+    common = jnp.concatenate([products[:-1], likelihood.shift_products(e)[:, 0]])
+    return WeightedResiduals(forces=forces, squared=products[-1], common=common, tool=tool, pull=pull)
 
 
 def parameter_forces(
@@ -130,7 +131,7 @@ def _columns(
     frame: ClosedFrame,
     context: FrameContext,
 ) -> tuple[Float[Array, "n 3 j"], Float[Array, "3 k"]]:
-    """Return G along some directions and e as columns, and the rows of the tool's residual for G, Q and e."""
+    """Return G along some directions and e as columns, and the rows of the tool's residual for G, Q, H F and e."""
     balance, linear = likelihood.balance, likelihood.frame
     x, s = linear.x, linear.s
 
@@ -145,7 +146,7 @@ def _columns(
     e = likelihood.forces(frame.y - look(model, x)) + linear.unbalanced
     seen = each(partial(balance.apply, linear.dr_dx), seen_shift(frame, dview))
     tool = jnp.concatenate(
-        [dtool, jnp.zeros((3, N_FIELDS)), tool_residual(sheet, model, theta, frame, context, x)[:, None]], axis=1
+        [dtool, _no_common(likelihood), tool_residual(sheet, model, theta, frame, context, x)[:, None]], axis=1
     )
     return jnp.concatenate([dforce - seen, e[:, :, None]], axis=2), tool / tool_sd(frame)
 
@@ -159,7 +160,7 @@ def _pull_rows(
     frame: ClosedFrame,
     context: FrameContext,
 ) -> Float[Array, "3 k"]:
-    """Return the rows of the residual of the tool's force, over s, theta in directions, fields (zero) and e."""
+    """Return the rows of the residual of the tool's force, over s, theta in directions, c and w (zero) and e."""
     assert frame.pull is not None and likelihood.adjoint is not None
     balance, linear, adjoint = likelihood.balance, likelihood.frame, likelihood.adjoint
     x, s = linear.x, linear.s
@@ -177,27 +178,31 @@ def _pull_rows(
     ds = own.T - jnp.einsum("nic,ni->cn", adjoint, jnp.where(held, pulled, linear.dr_ds))
     predicted = predicted_pull(sheet.balance, model, frame, s, x)
     e = predicted - jnp.einsum("nic,ni->c", adjoint, off_balance(linear)) - frame.pull.force
-    return frame.pull.weight * jnp.concatenate([ds, dtheta, jnp.zeros((3, N_FIELDS)), e[:, None]], axis=1)
+    return frame.pull.weight * jnp.concatenate([ds, dtheta, _no_common(likelihood), e[:, None]], axis=1)
+
+
+def _no_common(likelihood: FrameLikelihood) -> Float[Array, "3 k"]:
+    return jnp.zeros((3, len(likelihood.among)))
 
 
 @eqx.filter_jit
 def _inner_products(likelihood: FrameLikelihood, beyond: Float[Array, "n 3 j"]) -> Float[Array, "_k _k"]:
-    """Return the inner products of the columns of D (one a particle), G, Q and e; `beyond` holds those of G and e."""
-    balance, frame = likelihood.balance, likelihood.frame
-    slope, n = frame.dr_ds, len(frame.s)
-    own = balance.precision_along(frame, slope)
+    """Return the inner products of the columns of D (one a particle), G, Q, H F and e; `beyond` holds G and e."""
+    frame, d = likelihood.frame, beyond.shape[2] - 1
+    slope, white = frame.dr_ds, likelihood.whitened(beyond)
     shared = jnp.einsum("ni,nic->cn", slope, likelihood.noise)
-    own = own - shared.T @ jax.scipy.linalg.cho_solve((likelihood.spread, True), shared)
-    columns, white = _beside(beyond, likelihood.fields), _beside(likelihood.whitened(beyond), likelihood.white)
-    others = jnp.einsum("nic,nik->ck", likelihood.noise, columns)
-    solved = jax.scipy.linalg.cho_solve((likelihood.spread, True), others)
-    between = jnp.einsum("ni,nik->nk", slope, white) - shared.T @ solved
-    among = jnp.einsum("nij,nik->jk", columns, white) - others.T @ solved
-    k = columns.shape[2]
-    square = jnp.zeros((n + k, n + k)).at[:n, :n].set(own).at[:n, n:].set(between)
-    return square.at[n:, :n].set(between.T).at[n:, n:].set(among)
+    solved = jax.scipy.linalg.cho_solve((likelihood.spread, True), shared)
+    own = likelihood.balance.precision_along(frame, slope) - shared.T @ solved
 
+    def of_slope(columns: Float[Array, "n 3 k"], white: Float[Array, "n 3 k"]) -> Float[Array, "n k"]:
+        return jnp.einsum("ni,nik->nk", slope, white) - solved.T @ jnp.einsum("nic,nik->ck", likelihood.noise, columns)
 
-def _beside(beyond: Float[Array, "n 3 j"], fields: Float[Array, "n 3 q"]) -> Float[Array, "n 3 k"]:
-    """Return columns with those of the smooth fields inserted before the last one, which is e."""
-    return jnp.concatenate([beyond[:, :, :-1], fields, beyond[:, :, -1:]], axis=2)
+    def joined(of_beyond: Float[Array, "r j"], of_common: Float[Array, "r k"]) -> Float[Array, "r _j"]:
+        return jnp.concatenate([of_beyond[:, :d], of_common, of_beyond[:, d:]], axis=1)
+
+    fields = likelihood.fields
+    common = jnp.concatenate([likelihood.dot(fields, beyond, white), likelihood.shift_products(beyond)])
+    whole = joined(likelihood.dot(beyond, beyond, white), common.T)
+    among = jnp.concatenate([whole[:d], joined(common, likelihood.among), whole[d:]])
+    between = joined(of_slope(beyond, white), jnp.concatenate([of_slope(fields, likelihood.white), solved.T], axis=1))
+    return jnp.block([[own, between], [between.T, among]])

@@ -1,8 +1,8 @@
 """Sizes of the errors that no effect stands for, which are free in every hypothesis, and their prior.
 
-Force errors of the model, smooth force fields, the tool's reports and its measured force each have a variance, over the
-assumed one. Its logarithm is normal where only what is assumed is wrong, or, with the same probability, larger by any
-amount: then the model lacks something that has no name here.
+Force errors of the model, smooth force fields, the tool's reports, the steps of the tracker's walk and the tool's
+measured force each have a variance, over the assumed one. Its logarithm is normal where only what is assumed is wrong,
+or, with the same probability, larger by any amount: then the model lacks something that has no name here.
 """
 
 from dataclasses import dataclass, fields
@@ -27,6 +27,8 @@ class NoiseScales:
     """Variance of the smooth force fields."""
     tool: float = 1.0
     """Variance of the tool's residual."""
+    walk: float = 1.0
+    """Variance of the steps of the tracker's walk."""
     pull: float | None = None
     """Variance of the measured force of the tool; None where none was measured."""
 
@@ -42,8 +44,9 @@ class NoiseScales:
 
     @property
     def larger(self) -> float:
-        """Return the probability that any of them is larger because something is missing."""
-        return 1 - float(np.prod([1 - np.exp(_log_larger(value) - log_prior(value)) for value in self.values]))
+        """Return the probability that any of them is larger because something is missing; the walk has a name."""
+        unnamed = [value for value in (self.force, self.fields, self.tool, self.pull) if value is not None]
+        return 1 - float(np.prod([1 - np.exp(_log_larger(value) - log_prior(value)) for value in unnamed]))
 
 
 def log_prior(variance: float) -> float:

@@ -38,6 +38,8 @@ FORCE_VARIANCE = 0.012
 grasp. Measured: the likeliest on recordings of the reference with nothing undeclared."""
 AMPLITUDE = 0.365
 """Assumed sd of the smooth force fields [assumed force errors]; the likeliest on the same recordings."""
+WALK_STEP = 1e-6
+"""Assumed standard deviation of the step from frame to frame of what a tracker has a point drift by [m]."""
 SHEET_STRENGTH = 1e9
 """Attached neighbours that the whole sheet is worth [particles]; see `PriorConfig.sheet_strength`. Here all attachments
 resemble each other, as they did when the limits of the decisions were chosen."""
@@ -80,6 +82,26 @@ class Problem:
     def amplitude(self) -> float:
         """Return the standard deviation of the smooth force fields [force errors]."""
         return AMPLITUDE * (self.scales.fields / self.scales.force) ** 0.5
+
+    @property
+    def walk_step(self) -> float:
+        """Return the standard deviation of the step from frame to frame of what the tracker drifts by [m]."""
+        return WALK_STEP * self.scales.walk**0.5
+
+    @property
+    def drift_sd(self) -> float:
+        """Return the standard deviation of what the tracker has drifted by in the last frame [m]."""
+        return self.walk_step * max(self.history.frames[-1].index, 1) ** 0.5
+
+    def walk_variances(self, frames: list[int]) -> Float[np.ndarray, " t"]:
+        """Return the variances of the steps of the tracker's walk to frames of a grasp, in amplitudes of the noise.
+
+        The first is that from rest, the begin of the recording.
+        """
+        indices = [self.history.frames[k].index for k in frames]
+        steps = np.maximum(np.diff(indices, prepend=0), 1)
+        smooth = np.max(np.sum(self.noise**2, axis=1), initial=0.0)
+        return steps * (self.walk_step**2 / smooth if smooth else 0.0)
 
     @classmethod
     def build(cls, dataset: Dataset, library: tuple[Effect, ...]) -> "Problem":
@@ -127,6 +149,10 @@ class Problem:
     def by_part(self, frames: Iterable[int]) -> dict[int, list[int]]:
         """Return frames grouped by part."""
         return self.history.by(lambda one: one.part, frames)
+
+    def by_grasp(self, frames: Iterable[int]) -> dict[int, list[int]]:
+        """Return frames grouped by grasp."""
+        return self.history.by(lambda one: one.grasp, frames)
 
     def free(self, named: np.ndarray) -> np.ndarray:
         """Return the indices of named parameters, then of the other nuisance parameters."""

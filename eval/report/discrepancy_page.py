@@ -74,15 +74,27 @@ def story(found: Mapping[str, Any]) -> list[str]:
         sentences.append(_suggestion_sentence(found["suggestion"]))
     if not found["noise"]["still_frames"]:
         sentences.append(
-            f"There are no still frames: noise of {1e3 * found['noise']['sd_m']:.2g} mm, and as much that neighbours "
-            "share, was assumed."
+            f"There are no still frames: noise of {1e3 * found['noise']['sd_m']:.2g} mm was assumed, and of "
+            f"{1e3 * found['noise']['smooth_sd_m']:.2g} mm that neighbours share."
         )
+    sentences += _drift_sentences(found["noise"])
     if left_out := found["frames"]["left_out"]:
         sentences.append(
             f"{len(left_out)} frames of {len(left_out) + found['frames']['used']} are left out: the held tissue has "
             "another shape there than when the jaws closed on it, so its tracking is wrong there."
         )
     return sentences
+
+
+def _drift_sentences(noise: Mapping[str, Any]) -> list[str]:
+    """Return how much the tracker drifts, if that is more than its noise."""
+    step, drift = noise["tracker_walk_m"], noise["tracker_drift_m"]
+    if not drift > np.hypot(noise["sd_m"], noise["smooth_sd_m"]):
+        return []
+    return [
+        f"The tracker drifts: what it errs by changes by {1e3 * step:.2g} mm from frame to frame, alike for "
+        f"neighbours, and adds up to some {1e3 * drift:.2g} mm by the last one."
+    ]
 
 
 def _posterior_sentence(posterior: list[Mapping[str, Any]]) -> str:

@@ -20,7 +20,7 @@ def test_without_still_frames_the_noise_is_assumed():
     assert dataset.noise == assumed(NOISE)
 
 
-def test_points_that_state_noise_which_neighbours_share_have_it_and_others_as_much_of_it_as_of_all():
+def test_points_that_state_noise_which_neighbours_share_have_it_and_others_a_part_of_it():
     points = observed(1.0)[0].points
     found = stated(dataclasses.replace(points, sd=5e-4, smooth_sd=4e-4, smooth_length=0.01))
     assert (found.smooth_sd, found.length, found.frames) == (4e-4, 0.01, 0)
