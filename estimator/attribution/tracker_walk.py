@@ -1,12 +1,12 @@
 """A tracker's drift: a random walk of the shift of observed positions that neighbours share.
 
-A tracker follows a point from frame to frame, so that what it errs by in one frame it errs by in the next. With F the
-smooth fields of the noise, and M the amplitudes w of frame k are
+A tracker follows a point from frame to frame, so that what it errs by in one frame it errs by in the next. The
+amplitudes w of the smooth fields of the noise are, in frame k,
 
     w_k = w_(k-1) + step,    step ~ N(0, v I)
 
-with a variance v for each frame of the recording, from w = 0 at rest. It is eliminated frame by frame of a grasp, as a
-Kalman filter does it [Kalman 1960, doi:10.1115/1.3662552], and what is known of it from all frames is that of the
+with a variance v for each frame of the recording, from w = 0 at rest. The walk is eliminated frame by frame of a grasp,
+as a Kalman filter does it [Kalman 1960, doi:10.1115/1.3662552], and what is known of it from all frames is that of the
 smoother [Rauch, Tung and Striebel 1965, doi:10.2514/3.3166]. Grasps are taken to be independent.
 """
 
@@ -22,7 +22,7 @@ class Eliminated(NamedTuple):
     square: Float[np.ndarray, "k k"]
     """Inner products of the other columns."""
     log_det: float
-    """ln of how much the frames say of the walk, over its prior: ln |I + S^T M S|, with S S^T its prior covariance."""
+    """ln |I + S^T M S|, with M what the frames say of the walk and S S^T its prior covariance."""
 
 
 class Known(NamedTuple):
