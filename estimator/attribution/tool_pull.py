@@ -31,7 +31,7 @@ from ..filters.evidence import MeasuredPull
 from ..filters.force_balance import ForceBalance
 from ..filters.frame import Frame
 from ..filters.smooth_noise import each
-from ..physics.block_tridiagonal import assemble, cholesky, solve
+from ..physics.block_tridiagonal import normal_cholesky, solve
 from .grasped_frames import ClosedFrame, FramePull
 
 MODEL_SHARE = 0.05
@@ -83,7 +83,8 @@ def adjoint(balance: ForceBalance, linear: Frame, dP_dx: Float[Array, "n 3 c"]) 
     itself = balance.neighbours == jnp.arange(len(linear.x))[:, None]
     springs = jnp.where(itself, grip_stiffness(balance, linear)[:, None], 0.0)
     rows = linear.dr_dx + springs[:, :, None, None] * jnp.eye(3)[None, None]
-    factor = cholesky(assemble(balance.layout, [(balance.places, jnp.einsum("npij,nqik->npjqk", rows, rows))]))
+    n = len(linear.x)
+    factor = normal_cholesky(balance.layout, balance.places, rows, jnp.ones(n), jnp.zeros((n, 3, 3)))
 
     def solved(column: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         return balance.apply(rows, solve(balance.layout, factor, column))
