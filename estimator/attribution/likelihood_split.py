@@ -59,15 +59,13 @@ def likelihood_split(fit: Weighed) -> LikelihoodSplit:
     """Return the parts of a fit's log likelihood; frames are in the order of its weights."""
     problem, weights = fit.problem, fit.weights
     every, variance = fit.residuals, problem.scales.tool
-    fields, tool, grasps = dict[int, np.ndarray](), dict[int, float](), 0.0
-    likeliest = common_amplitudes(fit)
+    likeliest, tool, grasps = common_amplitudes(fit), dict[int, float](), 0.0
     for frames in problem.by_grasp(weights).values():
         known = common(problem, weights, every, frames)
         reports = np.array([np.asarray(every[k].tool) for k in frames])
         ratio, share = offset_share(problem.history.frames[frames[0]].frame, len(frames))
         offset = share * reports.sum(axis=0)
         for k, apart in zip(frames, reports - offset, strict=True):
-            fields[k] = np.asarray(likeliest[k].mean)
             tool[k] = -0.5 * float(apart @ apart / variance + 3 * np.log(variance))
         if problem.scales.pull is not None and problem.with_force(frames):
             pulls = np.array([np.asarray(every[k].pull)[:, None] for k in frames])
@@ -76,8 +74,8 @@ def likelihood_split(fit: Weighed) -> LikelihoodSplit:
                 tool[k] -= 0.5 * float(own @ own / problem.scales.pull + constant)
             whole = pull_products(pulls, [problem.history.frames[k].frame for k in frames])[0, 0]
             grasps -= 0.5 * float(whole - np.sum(pulls**2)) / problem.scales.pull
-        c = fields[frames[0]][:N_FIELDS]
-        steps = np.diff([fields[k][N_FIELDS:] for k in frames], axis=0, prepend=0)
+        amplitudes = np.array([np.asarray(likeliest[k].mean) for k in frames])
+        c, steps = amplitudes[0, :N_FIELDS], np.diff(amplitudes[:, N_FIELDS:], axis=0, prepend=0)
         walked = float(np.sum(np.sum(steps**2, axis=1) / problem.walk_variances(frames))) if steps.size else 0.0
         of_offset = float(offset @ offset) / (ratio * variance)
         grasps -= 0.5 * (float(c @ c) / problem.amplitude**2 + walked + known.log_det + of_offset)
@@ -86,7 +84,7 @@ def likelihood_split(fit: Weighed) -> LikelihoodSplit:
         seen = np.asarray(weights[k].seen)
         even = float(weights[k].log_determinant()) * seen / max(seen.sum(), 1.0)
         smooth_noise = seen_noise(problem.history.frames[k].frame, jnp.asarray(problem.noise))
-        squares, smooth = _squares(weights[k], smooth_noise, every[k].forces, jnp.asarray(fields[k]))
+        squares, smooth = _squares(weights[k], smooth_noise, every[k].forces, likeliest[k].mean)
         return -0.5 * (np.asarray(squares) + even), tool[k] - 0.5 * float(smooth)
 
     found = parallel_map(one, weights)
