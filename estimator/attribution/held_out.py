@@ -117,8 +117,8 @@ def predict_held_out(fitted: Fitted, part: int, *, drift: bool = True) -> HeldOu
         return weighed(problem, predicted, frames)
 
     def shifted(k: int) -> Float[np.ndarray, "m 3"]:
-        shift = shifts(problem, weights()[k], k) @ np.asarray(walks[k].mean)[N_FIELDS:]
-        return shift.reshape(-1, 3)[np.asarray(closed[k].frame.counted)]
+        moved = shift(problem, weights()[k], k, np.asarray(walks[k].mean)[N_FIELDS:])
+        return moved[np.asarray(closed[k].frame.counted)]
 
     def variances() -> Variances:
         known = _covariance(fitted)
@@ -205,10 +205,12 @@ def _variances(
     by_force, by_fit = responses(fitted, predicted, likelihood, k)
     error = np.asarray(problem.sheet.balance.error(jnp.asarray(predicted.states[k])))
     fields = np.einsum("ani,nij->aj", by_force, np.asarray(likelihood.fields)) * problem.amplitude
-    wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2)) + np.sum(fields**2, axis=1)
+    walked = (
+        np.einsum("ani,nij->aj", by_force, _noise_forces(problem, likelihood, k)) @ np.asarray(walk.root)[N_FIELDS:]
+    )
+    wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2))
+    wrong = wrong + np.sum(fields**2, axis=1) + np.sum(walked**2, axis=1)
     unsure = np.sum((by_fit @ known) * by_fit, axis=1)
-    walked = shifts(problem, likelihood, k) @ np.asarray(walk.root)[N_FIELDS:]
-    wrong = wrong + np.sum(walked**2, axis=1)
     return Variances(
         fit=np.maximum(unsure, 0).reshape(n, 3),
         others=wrong.reshape(n, 3) + noise_variance(problem, problem.history.frames[k].frame)[:, None],
@@ -239,17 +241,23 @@ def responses(
     return by_force, np.concatenate([by_s, by_theta], axis=1)
 
 
-def shifts(problem: Problem, likelihood: FrameLikelihood, k: int) -> Float[np.ndarray, "m c"]:
-    """Return by how much the predicted coordinates of frame k fall with each amplitude of the smooth noise [m].
+def shift(
+    problem: Problem, likelihood: FrameLikelihood, k: int, amplitudes: Float[np.ndarray, " c"]
+) -> Float[np.ndarray, "n 3"]:
+    """Return by how much the residual of frame k rises with an error of these amplitudes of the smooth noise [m].
 
     What is held is where it is observed, so that it takes its neighbours with it as far as it is observed wrongly.
     """
-    frame, balance = problem.history.frames[k].frame, likelihood.balance
-    seen = seen_noise(frame, jnp.asarray(problem.noise))
-    forces = np.array(each(partial(balance.apply, likelihood.frame.dr_dx), seen))
-    held = np.asarray(frame.held)
+    held = np.asarray(problem.history.frames[k].frame.held)
+    forces = _noise_forces(problem, likelihood, k) @ amplitudes
     forces[held] = 0.0
-    return np.linalg.solve(_with_held_fixed(likelihood, held), forces.reshape(3 * len(forces), -1))
+    return np.linalg.solve(_with_held_fixed(likelihood, held), forces.ravel()).reshape(-1, 3)
+
+
+def _noise_forces(problem: Problem, likelihood: FrameLikelihood, k: int) -> Float[np.ndarray, "n 3 c"]:
+    """Return the forces H F of each amplitude of the smooth noise in frame k."""
+    seen = seen_noise(problem.history.frames[k].frame, jnp.asarray(problem.noise))
+    return np.asarray(each(partial(likelihood.balance.apply, likelihood.frame.dr_dx), seen))
 
 
 def _with_held_fixed(likelihood: FrameLikelihood, held: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m m"]:

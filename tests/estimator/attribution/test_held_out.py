@@ -11,7 +11,7 @@ import pytest
 from jiggle_mj.estimator.attribution.every_frame import weighed
 from jiggle_mj.estimator.attribution.frame_likelihood import seen_noise
 from jiggle_mj.estimator.attribution.gauss_newton import start, weigh
-from jiggle_mj.estimator.attribution.held_out import predict_held_out, residuals, responses, shifts
+from jiggle_mj.estimator.attribution.held_out import predict_held_out, residuals, responses, shift
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects.frame_history import FrameHistory
 from jiggle_mj.estimator.perception.smooth_modes import smooth_modes
@@ -79,17 +79,17 @@ def erring(problem, at: list[int], w: np.ndarray):
     return replace(problem, history=FrameHistory(frames, np.asarray(problem.history.rest)))
 
 
-def test_what_is_observed_elsewhere_moves_the_residual_as_its_shifts_say(shared):
+def test_what_is_observed_elsewhere_moves_the_residual_as_its_shift_says(shared):
     """What follows the grip is predicted elsewhere too."""
     fitted, w = shared
     problem, point, k = fitted.problem, fitted.point, list(fitted.equations)[-1]
     with jax.enable_x64(True), one_thread():
-        moved = shifts(problem, weighed(problem, point, [k])[k], k) @ w
+        moved = shift(problem, weighed(problem, point, [k])[k], k, w)
         before, after = (
             residuals(one, start(one, point.theta, point.s, point.states, [k]), [k])
             for one in (problem, erring(problem, [k], w))
         )
-    found = moved.reshape(-1, 3)[np.asarray(problem.history.frames[k].frame.counted)]
+    found = moved[np.asarray(problem.history.frames[k].frame.counted)]
     np.testing.assert_allclose(after - before, found, atol=0.1 * np.abs(found).max())
 
 
