@@ -127,7 +127,7 @@ def close_the_loop(
         remainder=left,
         with_remainder=None
         if spare is None
-        else predict_held_out(last.fitted, spare, drift=False).beyond(*left.of(problem.history.frames, spare)),
+        else predict_held_out(last.fitted, spare, persistent=False).beyond(*left.of(problem.history.frames, spare)),
         problem=problem,
     )
 

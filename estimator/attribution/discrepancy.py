@@ -6,12 +6,14 @@ import numpy as np
 
 from jiggle_mj.estimate import Detection
 
+from ..perception.still_noise import StillNoise
 from .close_loop import Closed
 from .dataset import Dataset
 from .explain import explanation
 from .force_report import force_report
 from .hypotheses import Hypothesis
 from .localisation import localisation
+from .problem import Problem
 from .reported_part import reported_part
 from .suggestion import Suggestion
 
@@ -56,8 +58,7 @@ def discrepancy(closed: Closed, dataset: Dataset) -> dict[str, Any]:
             "smooth_sd_m": noise.smooth_sd,
             "smooth_length_m": noise.length,
             "still_frames": noise.frames,
-            "tracker_walk_m": closed.final.fitted.problem.walk_step,
-            "tracker_drift_m": closed.final.fitted.problem.drift_sd,
+            **_persistence(closed.final.fitted.problem, noise),
         },
         "frames": {"used": len(dataset.frames), "left_out": list(dataset.left_out)},
         "localisation": before,
@@ -108,10 +109,22 @@ def _probability(one: Hypothesis, probability: float) -> dict[str, Any]:
             "force": scales.force,
             "fields": scales.fields,
             "tool": scales.tool,
-            "walk": scales.walk,
+            "smooth": scales.smooth,
             "pull": scales.pull,
+            "noise": scales.noise,
         },
         "larger_errors": scales.larger,
+    }
+
+
+def _persistence(problem: Problem, noise: StillNoise) -> dict[str, float]:
+    """Return the autocorrelation of the errors, and the sd of what points err by in a frame's step and in all [m]."""
+    last, size = len(problem.history.frames) - 1, np.hypot(noise.sd, noise.smooth_sd * problem.scales.smooth**0.5)
+    step, whole = problem.new(last, last - 1 if last else None), problem.new(last, None)
+    return {
+        "autocorrelation": problem.scales.persistence,
+        "step_m": float(size * step**0.5),
+        "whole_m": float(size * whole**0.5),
     }
 
 

@@ -1,6 +1,7 @@
 """All frames of a recording at a point: their weights, normal equations, residuals and likelihood."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,16 @@ from ..effects.sheet_model import FrameContext
 from ..parallel_map import T, parallel_map
 from .frame_likelihood import FrameLikelihood, frame_likelihood
 from .grasped_frames import ClosedFrame
-from .linear import NormalEquations, WeightedResiduals, misfit, normal_equations
+from .linear import (
+    Columns,
+    NormalEquations,
+    Residuals,
+    WeightedResiduals,
+    columns_of,
+    normal_equations,
+    residuals_of,
+    weighted_residuals,
+)
 from .normal_equations import Common, common, pull_sum, tool_sum
 from .problem import Point, Problem
 
@@ -30,21 +40,33 @@ def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Fram
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameLikelihood:
-        return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise)
+        before = problem.before(k, frames)
+        persistence, new = problem.autocorrelation(k, before), problem.new(k, before)
+        return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise, persistence, new)
 
     return each_frame(problem, point, frames, one)
 
 
 def linearised(
-    problem: Problem, point: Point, weights: dict[int, FrameLikelihood], along: Float[np.ndarray, "p d"]
+    problem: Problem,
+    point: Point,
+    weights: dict[int, FrameLikelihood],
+    residuals: dict[int, WeightedResiduals],
+    along: Float[np.ndarray, "p d"],
 ) -> dict[int, NormalEquations]:
     """Return the normal equations of each frame, linearised where its weights were computed."""
     theta, along_ = jnp.asarray(point.theta), jnp.asarray(along)
 
-    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> NormalEquations:
-        return normal_equations(problem.sheet, weights[k], theta, along_, frame, context)
+    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> Columns:
+        return columns_of(problem.sheet, weights[k], theta, along_, frame, context)
 
-    return each_frame(problem, point, weights, one)
+    columns = each_frame(problem, point, weights, one)
+
+    def equations(k: int) -> NormalEquations:
+        before = problem.before(k, weights)
+        return normal_equations(weights[k], columns[k], None if before is None else columns[before], residuals[k])
+
+    return parallel_map(equations, weights)
 
 
 def misfit_under(problem: Problem, weights: dict[int, FrameLikelihood], point: Point) -> float:
@@ -66,10 +88,29 @@ def residual(problem: Problem, weights: dict[int, FrameLikelihood], point: Point
     """Return the weighted residuals of a point's predictions in each frame, under weights of another point."""
     theta, s = jnp.asarray(point.theta), jnp.asarray(point.s)
 
-    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> WeightedResiduals:
-        return misfit(problem.sheet, weights[k], theta, s, frame, context, x)
+    def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> Residuals:
+        return residuals_of(problem.sheet, weights[k], theta, s, frame, context, x)
 
-    return each_frame(problem, point, weights, one)
+    return weighted_together(problem, weights, each_frame(problem, point, weights, one))
+
+
+def weighted_together(
+    problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, Residuals]
+) -> dict[int, WeightedResiduals]:
+    """Return the weighted residuals of frames from the residuals of each."""
+    own = dict[int, Residuals]()
+    for frames in problem.by_grasp(sorted(every)).values():
+        last = jnp.zeros_like(every[frames[0]].positions)
+        for k in frames:
+            last = jnp.where(weights[k].seen[:, None] > 0, every[k].positions, last)
+            own[k] = replace(every[k], positions=last)
+
+    def one(k: int) -> WeightedResiduals:
+        before = problem.before(k, weights)
+        nothing = jnp.zeros_like(own[k].positions)
+        return weighted_residuals(weights[k], own[k], nothing if before is None else own[before].positions)
+
+    return parallel_map(one, weights)
 
 
 def in_common(

@@ -88,7 +88,7 @@ def _refined(now: Fitted, log: Callable[[str], None] = lambda _: None) -> Fitted
 def _with_likeliest_scales(now: Fitted, log: Callable[[str], None] = lambda _: None) -> Fitted:
     """Return a fit's point under its likeliest scales."""
     at = with_likeliest_scales(now)
-    log(f"variances {', '.join(f'{value:.3g}' for value in at.problem.scales.values)} of the assumed ones")
+    log(f"errors: {at.problem.scales}")
     return fit_at(at, now.named, now.equations) if at.weights is now.weights else linearised_fit(at, now.named)
 
 
@@ -96,7 +96,7 @@ def without(fitted: Fitted, part: int) -> Fitted:
     """Return one more step from a fit without the frames of one part, from the normal equations that it has.
 
     The likeliest set of attachments is no candidate: of many equally likely sets, fewer frames would take another one
-    at random.
+    at random. The first frame after the part counts as before, by what it adds to the last one of the part.
     """
     kept = [k for k in fitted.equations if fitted.problem.history.frames[k].part != part]
     weights, residuals = {k: fitted.weights[k] for k in kept}, {k: fitted.residuals[k] for k in kept}

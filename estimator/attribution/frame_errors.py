@@ -1,9 +1,11 @@
 """What a frame's observed positions say of its errors: of positions, of smooth fields and of forces.
 
-With the terms of `likelihood_slope`, the noise n_y of the positions, the amplitudes a of the smooth noise, w of the
-tracker's walk and c of the smooth force fields are normal given the frames, and the force error is
+With the terms of `likelihood_slope`, the noise n_y of the positions, the amplitudes a of the smooth noise and c of the
+smooth force fields are normal given the frames, and the force error is
 
-    f = H (y - h(x) + F (a + w) - n_y) + r + Q c.
+    f = i + H (F a - n_y) + Q c,
+
+all of them innovations, i that of H (y - h(x)) + r.
 """
 
 from collections.abc import Iterable
@@ -18,34 +20,33 @@ from jaxtyping import Array, Float
 from ..filters.smooth_noise import each
 from ..physics.block_tridiagonal import BlockTridiagonal, inverse_band, window_sums
 from .every_frame import each_frame
-from .frame_likelihood import N_FIELDS, FrameLikelihood, seen_noise
+from .frame_likelihood import FrameLikelihood, seen_noise
 from .gauss_newton import Weighed
 from .grasped_frames import ClosedFrame
-from .normal_equations import common, common_products
-from .tracker_walk import known_walk
+from .normal_equations import common
 
 
 class CommonAmplitudes(eqx.Module):
-    """What the frames of a grasp say of c and, in one of them, of w."""
+    """What the frames of a grasp say of c."""
 
-    mean: Float[Array, " k"]
-    """Mean, of c first."""
-    root: Float[Array, "k k"]
+    mean: Float[Array, " q"]
+    """Mean."""
+    root: Float[Array, "q q"]
     """Lower Cholesky factor of the covariance."""
 
 
 class FrameErrors(eqx.Module):
-    """What a frame's positions say of their errors: of F (a + w) - n_y and of c, each with the mean first.
+    """What a frame's positions say of their errors: of F a - n_y and of c, each with the mean first.
 
-    The other columns are those of a root of the covariance, less the part that n_y has with a, w and c known.
+    The other columns are those of a root of the covariance, less the part that n_y has with a and c known.
     """
 
     positions: Float[Array, "n 3 k"]
-    """Errors F (a + w) - n_y of the positions [m]."""
+    """Errors F a - n_y of the positions [m]."""
     amplitudes: Float[Array, "q k"]
     """Amplitudes c."""
     position_covariance: BlockTridiagonal
-    """Covariance of n_y with a, w and c known [m^2]."""
+    """Covariance of n_y with a and c known [m^2]."""
 
 
 class ForceErrors(eqx.Module):
@@ -79,52 +80,32 @@ class ForceErrors(eqx.Module):
         return jax.tree.map(lambda *each: sum(each[1:], each[0]), *frames)
 
 
-def common_amplitudes(at: Weighed, unseen: Iterable[int] = ()) -> dict[int, CommonAmplitudes]:
-    """Return what is known in each frame of what the frames of its grasp have in common.
-
-    Args:
-        at: has the frames.
-        unseen: further frames, in which the walk goes on.
-    """
-    found, shifts = dict[int, CommonAmplitudes](), 3 * at.problem.noise.shape[1]
-    for frames in at.problem.by_grasp({*at.weights, *unseen}).values():
-        seen = [k for k in frames if k in at.weights]
-        mean, root = np.zeros(N_FIELDS), at.problem.amplitude * np.eye(N_FIELDS)
-        own, beside = np.zeros((len(frames), shifts, shifts)), np.zeros((len(frames), shifts, N_FIELDS + 1))
-        if seen:
-            c = common(at.problem, at.weights, at.residuals, seen)
-            covariance = np.linalg.inv(c.precision)
-            mean, root = -covariance @ c.products, np.linalg.cholesky(covariance)
-            among, products = common_products(at.weights, at.residuals, seen)
-            where = np.isin(frames, seen)
-            own[where], beside[where] = among[:, N_FIELDS:, N_FIELDS:], products[:, N_FIELDS:]
-        walk = known_walk(own, beside, at.problem.walk_variances(frames))
-        for k, slope, left in zip(frames, walk.mean, walk.covariance, strict=True):
-            of_walk = -slope[:, :N_FIELDS] @ mean - slope[:, -1]
-            roots = [[root, np.zeros((N_FIELDS, shifts))], [-slope[:, :N_FIELDS] @ root, np.linalg.cholesky(left)]]
-            found[k] = CommonAmplitudes(
-                mean=jnp.asarray(np.concatenate([mean, of_walk])), root=jnp.asarray(np.block(roots))
-            )
+def common_amplitudes(at: Weighed) -> dict[int, CommonAmplitudes]:
+    """Return what is known in each frame of what the frames of its grasp have in common."""
+    found = dict[int, CommonAmplitudes]()
+    for frames in at.problem.by_grasp(at.weights).values():
+        c = common(at.problem, at.weights, at.residuals, frames)
+        covariance = np.linalg.inv(c.precision)
+        known = CommonAmplitudes(
+            mean=jnp.asarray(-covariance @ c.products), root=jnp.asarray(np.linalg.cholesky(covariance))
+        )
+        found |= dict.fromkeys(frames, known)
     return found
 
 
 def frame_errors(
-    likelihood: FrameLikelihood, smooth: Float[Array, "n 3 m"], e: Float[Array, "n 3"], known: CommonAmplitudes
+    likelihood: FrameLikelihood, smooth: Float[Array, "n 3 m"], i: Float[Array, "n 3"], known: CommonAmplitudes
 ) -> FrameErrors:
-    """Return what is known of a frame's errors, with the smooth noise's fields F [m] and e = H (y - h(x)) + r [N]."""
+    """Return what is known of a frame's errors, with the smooth noise's fields F [m] and the innovation i [N]."""
     balance, frame = likelihood.balance, likelihood.frame
     m, size = smooth.shape[2], len(known.mean)
-    both = jnp.concatenate([known.mean[:, None], known.root, jnp.zeros((size, m))], axis=1)
-    c, w = both[:N_FIELDS], both[N_FIELDS:]
-    forces = likelihood.fields @ c + each(partial(balance.apply, frame.dr_dx), smooth @ w)
-    forces = forces.at[:, :, 0].add(e)
+    c = jnp.concatenate([known.mean[:, None], known.root, jnp.zeros((size, m))], axis=1)
+    forces = (likelihood.fields @ c).at[:, :, 0].add(i)
     a = -jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nim,nik->mk", likelihood.noise, forces))
     a = a.at[:, 1 + size :].add(jax.scipy.linalg.solve_triangular(likelihood.spread.T, jnp.eye(m)))
     forces = forces + each(partial(balance.apply, frame.dr_dx), smooth @ a)
     explained = each(partial(balance.explained, frame), forces)
-    return FrameErrors(
-        positions=smooth @ (a + w) - explained, amplitudes=c, position_covariance=inverse_band(frame.factor)
-    )
+    return FrameErrors(positions=smooth @ a - explained, amplitudes=c, position_covariance=inverse_band(frame.factor))
 
 
 def force_errors(at: Weighed) -> ForceErrors:
@@ -132,7 +113,7 @@ def force_errors(at: Weighed) -> ForceErrors:
     amplitudes, noise = common_amplitudes(at), jnp.asarray(at.problem.noise)
 
     def one(k: int, frame: ClosedFrame, *_: object) -> ForceErrors:
-        found = _force_errors(at.weights[k], seen_noise(frame, noise), at.residuals[k].forces, amplitudes[k])
+        found = _force_errors(at.weights[k], seen_noise(frame, noise), at.residuals[k].innovation, amplitudes[k])
         return jax.block_until_ready(found)
 
     return ForceErrors.together(each_frame(at.problem, at.point, at.weights, one).values())
@@ -140,10 +121,10 @@ def force_errors(at: Weighed) -> ForceErrors:
 
 @eqx.filter_jit
 def _force_errors(
-    likelihood: FrameLikelihood, smooth: Float[Array, "n 3 m"], e: Float[Array, "n 3"], known: CommonAmplitudes
+    likelihood: FrameLikelihood, smooth: Float[Array, "n 3 m"], i: Float[Array, "n 3"], known: CommonAmplitudes
 ) -> ForceErrors:
     balance, linear = likelihood.balance, likelihood.frame
-    errors = frame_errors(likelihood, smooth, e, known)
+    errors = frame_errors(likelihood, smooth, i, known)
     f = each(partial(balance.apply, linear.dr_dx), errors.positions) + likelihood.fields @ errors.amplitudes
     left = window_sums(balance.layout, errors.position_covariance, balance.places, linear.dr_dx)
-    return ForceErrors.of(likelihood, f.at[:, :, 0].add(e), left)
+    return ForceErrors.of(likelihood, f.at[:, :, 0].add(i), left)

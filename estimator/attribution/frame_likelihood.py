@@ -1,18 +1,23 @@
 """Likelihood of one frame's observed positions, linearised at its predicted state.
 
-Let e = H (y - h(x)), with x the predicted equilibrium. Let N be the covariance of the model's force errors and of the
-noise of observed positions, mapped to forces by H. Then
+Let e = y - h(x) be the residual of the positions, with x the predicted equilibrium. Errors of a frame persist in the
+next one of the grasp, as an autoregressive process of order 1 [Box, Jenkins & Reinsel 2008, doi:10.1002/9781118619193,
+section 3.2]. With rho the autocorrelation of frame k and the one before it, or of rest, where e = 0, and kappa the
+variance of all errors over the assumed one, the forces of the innovation are
 
-    e + H F (a + w) + Q c = n,    n ~ N(0, N),  a ~ N(0, I),  c ~ N(0, amplitude^2 I)
+    i = H (e_k - rho e_(k-1)) / sqrt(kappa (1 - rho^2)).
 
-with F the smooth fields of the noise, independent in every frame, w a random walk from frame to frame of the grasp
-(`tracker_walk`), and Q smooth force fields that stand for any other error of the model and are the same in all frames
-of a grasp. So the log density of the positions is, for c = w = 0,
+Let N be the covariance of the model's force errors and of the noise of observed positions, mapped to forces by H. Then
 
-    -1/2 [e^T (N + H F F^T H^T)^-1 e + ln |N + H F F^T H^T| - 2 ln |H|]
+    i + H F a + Q c = n,    n ~ N(0, N),  a ~ N(0, I),  c ~ N(0, amplitude^2 I)
 
-up to a constant. A model that yields more has a wider density, so a comparison of models needs both determinants. w and
-c are eliminated grasp by grasp (`normal_equations.common`).
+with F the smooth fields of the noise, and Q smooth force fields that stand for any other error of the model and are the
+same in all frames of a grasp. So the log density of the positions is, given those before and for c = 0,
+
+    -1/2 [i^T (N + H F F^T H^T)^-1 i + ln |N + H F F^T H^T| - 2 ln |H| + m ln (kappa (1 - rho^2))]
+
+up to a constant, with m the number of observed coordinates. A model that yields more has a wider density, so a
+comparison of models needs both determinants. c is eliminated grasp by grasp (`normal_equations.common`).
 """
 
 from dataclasses import replace
@@ -60,10 +65,14 @@ class FrameLikelihood(eqx.Module):
     """Smooth force fields Q."""
     white: Float[Array, "n 3 q"]
     """Smooth force fields, whitened: N^-1 Q."""
-    among: Float[Array, "k k"]
-    """Inner products under (N + H F F^T H^T)^-1 of the columns that frames have in common, Q and H F."""
+    among: Float[Array, "q q"]
+    """Inner products of Q under (N + H F F^T H^T)^-1."""
     log_square: Float[Array, ""]
     """ln |H^T H| over the particles with a force equation."""
+    persistence: Float[Array, ""]
+    """Autocorrelation rho of its errors and of those of the frame before."""
+    new: Float[Array, ""]
+    """Variance kappa (1 - rho^2) of what is new of its errors, over the assumed one of all."""
     adjoint: Float[Array, "n 3 3"] | None = None
     """By how much the tool's force falls with a force on each particle [1]; None where no frame has a measured one."""
 
@@ -75,22 +84,18 @@ class FrameLikelihood(eqx.Module):
         solved = jax.scipy.linalg.cho_solve((self.spread, True), b)
         return jnp.einsum("nil,nir->lr", left, white) - a.T @ solved
 
-    def shift_products(self, columns: Float[Array, "n 3 k"]) -> Float[Array, "c k"]:
-        """Return (H F)^T (N + H F F^T H^T)^-1 columns."""
-        return jax.scipy.linalg.cho_solve((self.spread, True), jnp.einsum("nic,nik->ck", self.noise, columns))
-
-    def shift_square(self) -> Float[Array, "c c"]:
-        """Return (H F)^T (N + H F F^T H^T)^-1 H F."""
-        eye = jnp.eye(len(self.spread))
-        return eye - jax.scipy.linalg.cho_solve((self.spread, True), eye)
+    def innovation(self, now: Float[Array, "*n"], before: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Return the innovation of errors, or of how they change, from those of this frame and of the one before."""
+        return (now - self.persistence * before) / jnp.sqrt(self.new)
 
     def whitened(self, columns: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
         """Return N^-1 times each column."""
         return each(partial(self.balance.whitened, self.frame), columns)
 
+    @eqx.filter_jit
     def forces(self, residual: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """Return the forces H (y - h(x)) of a residual of positions y - h(x) [m]."""
-        return self.balance.apply(self.frame.dr_dx, self.seen[:, None] * residual)
+        """Return the forces H e of a residual e of positions [m]."""
+        return self.balance.apply(self.frame.dr_dx, residual)
 
     @property
     def force_share(self) -> Float[Array, " n"]:
@@ -101,12 +106,14 @@ class FrameLikelihood(eqx.Module):
     def log_determinant(self) -> Float[Array, ""]:
         """Return ln |C| of the observed positions' covariance C, up to the precision of their white noise.
 
-        It is ln |N + H F F^T H^T| - 2 ln |H|. Rows without a force equation are those of inputs, and do not count.
+        It is ln |N + H F F^T H^T| - 2 ln |H| + m ln (kappa (1 - rho^2)). Rows without a force equation are those of
+        inputs, and do not count.
         """
         w, known = self.frame.weight, self.frame.weight > 0
         log_weights = jnp.sum(jnp.where(known, 3 * jnp.log(jnp.where(known, w, 1.0)), 0.0))
         smooth = 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
-        return log_det(self.frame.factor) - log_weights + smooth - self.log_square
+        new = 3 * jnp.sum(self.seen) * jnp.log(self.new)
+        return log_det(self.frame.factor) - log_weights + smooth - self.log_square + new
 
     def inner(self, rows: Float[Array, "n p 3 3"]) -> Float[Array, "n p 3 3"]:
         """Return rows of H with nothing but what couples particles with a force equation."""
@@ -129,14 +136,18 @@ def frame_likelihood(
     context: FrameContext,
     x: Float[Array, "n 3"],
     noise: Float[Array, "n modes"],
+    persistence: float = 0.0,
+    new: float = 1.0,
 ) -> FrameLikelihood:
     """Return a frame's likelihood at its predicted state x; `noise` are the smooth noise's fields [m].
 
-    It is two programs, like `normal_equations`: as one, XLA lays the factor out so that a solve takes 1.5 times as
-    long.
+    `persistence` is the autocorrelation of its errors and of those of the frame before, and `new` the variance of what
+    is new of them. It is two programs, like `normal_equations`: as one, XLA lays the factor out so that a solve takes
+    1.5 times as long.
     """
     likelihood = _likelihood(*around(sheet, theta, s, frame, context, x), frame, noise)
     likelihood = replace(likelihood, log_square=_log_square(likelihood))
+    likelihood = replace(likelihood, persistence=jnp.asarray(persistence), new=jnp.asarray(new))
     if frame.pull is None:
         return likelihood
     return replace(likelihood, adjoint=_pull_adjoint(sheet, likelihood, theta, frame, context))
@@ -147,7 +158,25 @@ def with_force_sd(
 ) -> FrameLikelihood:
     """Return a frame's likelihood with another standard deviation of force errors, the field of `ForceBalance` [N]."""
     found = _likelihood(*_with_force_sd(likelihood, force_sd), frame, noise)
-    return replace(found, log_square=likelihood.log_square, adjoint=likelihood.adjoint)
+    kept = {name: getattr(likelihood, name) for name in ("log_square", "persistence", "new", "adjoint")}
+    return replace(found, **kept)
+
+
+@eqx.filter_jit
+def with_noise(
+    likelihood: FrameLikelihood, factor: Float[Array, ""], persistence: Float[Array, ""], new: Float[Array, ""]
+) -> FrameLikelihood:
+    """Return a frame's likelihood with another autocorrelation and share of new errors, and a larger smooth noise."""
+    eye = jnp.eye(len(likelihood.spread))
+    spread = eye + factor**2 * (likelihood.spread @ likelihood.spread.T - eye)
+    changed = replace(
+        likelihood,
+        noise=factor * likelihood.noise,
+        spread=jnp.linalg.cholesky(spread),
+        persistence=persistence,
+        new=new,
+    )
+    return replace(changed, among=changed.dot(changed.fields, changed.fields, changed.white))
 
 
 @eqx.filter_jit
@@ -200,12 +229,12 @@ def _likelihood(
         spread=jnp.linalg.cholesky(jnp.eye(smooth.shape[2]) + jnp.einsum("nia,nib->ab", smooth, white)),
         fields=fields,
         white=each(partial(balance.whitened, linear), fields),
-        among=jnp.zeros((0, 0)),
+        among=jnp.zeros((N_FIELDS, N_FIELDS)),
         log_square=jnp.zeros(()),
+        persistence=jnp.zeros(()),
+        new=jnp.ones(()),
     )
-    of_fields, beside = likelihood.dot(fields, fields, likelihood.white), likelihood.shift_products(fields)
-    among = jnp.block([[of_fields, beside.T], [beside, likelihood.shift_square()]])
-    return eqx.tree_at(lambda one: one.among, likelihood, among)
+    return replace(likelihood, among=likelihood.dot(fields, fields, likelihood.white))
 
 
 @eqx.filter_jit

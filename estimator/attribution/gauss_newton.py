@@ -175,7 +175,8 @@ def linearise_at(problem: Problem, named: np.ndarray, point: Point, frames: list
 
 def linearised_fit(at: Weighed, named: np.ndarray) -> Fitted:
     """Return a weighed point as a fit, with normal equations and posterior there."""
-    equations = linearised(at.problem, at.point, at.weights, directions(at.problem, at.problem.free(named)))
+    along = directions(at.problem, at.problem.free(named))
+    equations = linearised(at.problem, at.point, at.weights, at.residuals, along)
     return fit_at(at, named, equations)
 
 

@@ -1,11 +1,11 @@
 """Held-out prediction: predict frames that a fit never saw, from the tool's reports alone.
 
-Where other frames of the same grasp were fitted, the tracker's drift goes on from what is known of it there.
+Where other frames of the same grasp were fitted before, their errors persist.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,14 +13,12 @@ from jaxtyping import Bool, Float
 from scipy.stats import norm
 
 from ..belief.gaussian_information import GaussianInformation
-from ..filters.smooth_noise import each
 from ..parallel_map import parallel_map
 from .every_frame import directions, weighed
-from .frame_errors import CommonAmplitudes, common_amplitudes
-from .frame_likelihood import N_FIELDS, FrameLikelihood, seen_noise
+from .frame_likelihood import FrameLikelihood
 from .gauss_newton import Fitted
 from .grasped_frames import ClosedFrame
-from .linear import parameter_forces
+from .linear import columns_of
 from .problem import Point, Problem
 from .sheet import predict_all
 
@@ -37,8 +35,8 @@ class Variances:
     fit: Float[np.ndarray, "m 3"]
     """Variance by what the fit leaves open of the stiffnesses and the parameters."""
     others: Float[np.ndarray, "m 3"]
-    """Variance by force errors of the model, its smooth fields, the noise of observed positions and the tracker's walk,
-    of the sizes that were fitted; or by the remainder instead."""
+    """Variance by force errors of the model, its smooth fields and the noise of observed positions, of the sizes that
+    were fitted, as far as they are new; or by the remainder instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,32 +97,38 @@ def held_out(fits: dict[int, Fitted]) -> list[HeldOut]:
     return list(parallel_map(lambda part: predict_held_out(fits[part], part), fits).values())
 
 
-def predict_held_out(fitted: Fitted, part: int, *, drift: bool = True) -> HeldOut:
+def predict_held_out(fitted: Fitted, part: int, *, persistent: bool = True) -> HeldOut:
     """Return the prediction of one part that was not fitted to.
 
     Args:
         fitted: the fit.
         part: number of the part.
-        drift: whether what is known of the tracker's drift is in it.
+        persistent: whether what persists of the errors of the last fitted frame is in it.
     """
     problem = fitted.problem
-    frames = problem.frames({part})
-    predicted, closed = from_rest(problem, fitted.point, frames, by_tool=True), problem.history.frames
-    walks = common_amplitudes(fitted, frames)
+    frames, closed = problem.frames({part}), problem.history.frames
+    before = {k: problem.before(k, fitted.weights) for k in frames}
+    lasts = sorted({last for last in before.values() if last is not None})
+    predicted = from_rest(problem, fitted.point, [*lasts, *frames], by_tool=True)
 
     @cache
     def weights() -> dict[int, FrameLikelihood]:
         return weighed(problem, predicted, frames)
 
-    def shifted(k: int) -> Float[np.ndarray, "m 3"]:
-        moved = shift(problem, weights()[k], k, np.asarray(walks[k].mean)[N_FIELDS:])
-        return moved[np.asarray(closed[k].frame.counted)]
+    def lasting(k: int) -> Float[np.ndarray, "m 3"]:
+        last, counted = before[k], np.asarray(closed[k].frame.counted)
+        if last is None:
+            return np.zeros((int(counted.sum()), 3))
+        frame = closed[last].frame
+        error = np.where(np.asarray(frame.counted)[:, None], np.asarray(frame.y) - predicted.seen[last], 0.0)
+        return problem.autocorrelation(k, last) * error[counted]
 
     def variances() -> Variances:
         known = _covariance(fitted)
 
         def one(k: int) -> Variances:
-            return _variances(fitted, predicted, weights()[k], k, known, walks[k])
+            found = _variances(fitted, predicted, weights()[k], k, known)
+            return replace(found, others=problem.new(k, before[k]) * found.others)
 
         every = parallel_map(one, frames)
         counted = {k: np.asarray(closed[k].frame.counted) for k in frames}
@@ -134,15 +138,19 @@ def predict_held_out(fitted: Fitted, part: int, *, drift: bool = True) -> HeldOu
         )
 
     residual = residuals(problem, predicted, frames)
-    if drift and any(np.any(np.asarray(walks[k].mean)[N_FIELDS:]) for k in frames):
-        residual = residual + np.concatenate(list(parallel_map(shifted, frames).values()))
+    if persistent:
+        residual = residual - np.concatenate([lasting(k) for k in frames])
     return HeldOut(residual=residual, compute_variances=variances)
 
 
 def noise_variance(problem: Problem, frame: ClosedFrame) -> Float[np.ndarray, " n"]:
-    """Return the variance of a coordinate of each particle by the noise of observed positions [m^2]."""
-    white = 1 / np.maximum(np.asarray(frame.precision)[:, 0, 0], 1.0)
-    return white + np.sum(problem.noise**2, axis=1)
+    """Return the variance of a coordinate of each particle by the assumed noise of observed positions [m^2]."""
+    return white_variance(frame) + np.sum(problem.assumed_noise**2, axis=1)
+
+
+def white_variance(frame: ClosedFrame) -> Float[np.ndarray, " n"]:
+    """Return the variance of a coordinate of each particle by the white noise of observed positions [m^2]."""
+    return 1 / np.maximum(np.asarray(frame.precision)[:, 0, 0], 1.0)
 
 
 def residuals(problem: Problem, point: Point, frames: list[int]) -> Float[np.ndarray, "m 3"]:
@@ -189,7 +197,6 @@ def _variances(
     likelihood: FrameLikelihood,
     k: int,
     known: Float[np.ndarray, "k k"],
-    walk: CommonAmplitudes,
 ) -> Variances:
     """Return the variances of each observed coordinate of frame k.
 
@@ -199,21 +206,18 @@ def _variances(
         likelihood: weights at the predicted state.
         k: the frame.
         known: covariance of s and parameters.
-        walk: what is known of the tracker's walk.
     """
     problem, n = fitted.problem, len(likelihood.seen)
+    closed = problem.history.frames[k].frame
     by_force, by_fit = responses(fitted, predicted, likelihood, k)
     error = np.asarray(problem.sheet.balance.error(jnp.asarray(predicted.states[k])))
     fields = np.einsum("ani,nij->aj", by_force, np.asarray(likelihood.fields)) * problem.amplitude
-    walked = (
-        np.einsum("ani,nij->aj", by_force, _noise_forces(problem, likelihood, k)) @ np.asarray(walk.root)[N_FIELDS:]
-    )
     wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2))
-    wrong = wrong + np.sum(fields**2, axis=1) + np.sum(walked**2, axis=1)
+    wrong = wrong + np.sum(fields**2, axis=1)
     unsure = np.sum((by_fit @ known) * by_fit, axis=1)
     return Variances(
         fit=np.maximum(unsure, 0).reshape(n, 3),
-        others=wrong.reshape(n, 3) + noise_variance(problem, problem.history.frames[k].frame)[:, None],
+        others=wrong.reshape(n, 3) + (white_variance(closed) + np.sum(problem.noise**2, axis=1))[:, None],
     )
 
 
@@ -228,36 +232,18 @@ def responses(
     closed, states = problem.history.frames[k].frame, jnp.asarray(predicted.states)
     held, H = np.asarray(closed.held), _with_held_fixed(likelihood, np.asarray(closed.held))
     by_force = np.where(held[None, :, None], 0.0, np.linalg.inv(H).reshape(3 * n, n, 3))
-    of_parameters = parameter_forces(
+    columns = columns_of(
         problem.sheet,
         likelihood,
         jnp.asarray(predicted.theta),
         jnp.asarray(directions(problem, fitted.free)),
         closed,
         problem.history.context(k, states),
-    )[:, :, : len(fitted.free)]
+    )
+    of_parameters = columns.of_theta[:, :, : len(fitted.free)]
     by_s = np.einsum("ani,ni->an", by_force, np.asarray(likelihood.frame.dr_ds))
     by_theta = np.einsum("ani,nij->aj", by_force, np.asarray(of_parameters))
     return by_force, np.concatenate([by_s, by_theta], axis=1)
-
-
-def shift(
-    problem: Problem, likelihood: FrameLikelihood, k: int, amplitudes: Float[np.ndarray, " c"]
-) -> Float[np.ndarray, "n 3"]:
-    """Return by how much the residual of frame k rises with an error of these amplitudes of the smooth noise [m].
-
-    What is held is where it is observed, so that it takes its neighbours with it as far as it is observed wrongly.
-    """
-    held = np.asarray(problem.history.frames[k].frame.held)
-    forces = _noise_forces(problem, likelihood, k) @ amplitudes
-    forces[held] = 0.0
-    return np.linalg.solve(_with_held_fixed(likelihood, held), forces.ravel()).reshape(-1, 3)
-
-
-def _noise_forces(problem: Problem, likelihood: FrameLikelihood, k: int) -> Float[np.ndarray, "n 3 c"]:
-    """Return the forces H F of each amplitude of the smooth noise in frame k."""
-    seen = seen_noise(problem.history.frames[k].frame, jnp.asarray(problem.noise))
-    return np.asarray(each(partial(likelihood.balance.apply, likelihood.frame.dr_dx), seen))
 
 
 def _with_held_fixed(likelihood: FrameLikelihood, held: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m m"]:

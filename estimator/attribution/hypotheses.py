@@ -260,9 +260,8 @@ def left_out(last: Hypothesis, one: AddedEffect, log: Log) -> Hypothesis:
 
 
 def _report(one: Hypothesis, log: Log) -> None:
-    scales = ", ".join(f"{value:.2g}" for value in one.fitted.problem.scales.values)
     sizes = "; ".join(np.array2string(one.theta(added), precision=4) for added in one.added)
-    log(f"{one.title}: ln Z {one.log_evidence:.1f}, theta {sizes}, variances {scales}")
+    log(f"{one.title}: ln Z {one.log_evidence:.1f}, theta {sizes}, errors {one.fitted.problem.scales}")
 
 
 def leave_one_out(fitted: Fitted, used: set[int]) -> dict[int, Fitted]:

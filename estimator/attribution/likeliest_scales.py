@@ -1,7 +1,7 @@
 """The noise scales that are likeliest at a fit's point.
 
-Those of the walk, the smooth fields, the tool and its force follow from the residuals that there are. The variance v of
-force errors changes the weights of all frames. At its maximum the likelihood has
+Those of the noise (`likeliest_noise`), the smooth fields, the tool and its force follow from the residuals that there
+are. The variance v of force errors changes the weights of all frames. At its maximum the likelihood has
 
     v = sum |f|^2 / degrees,
 
@@ -9,20 +9,19 @@ with f the mean errors in units of the assumed ones, and the number of errors th
 doi:10.1162/neco.1992.4.3.415]. Both change with v, so that this is repeated; from the second time on by a secant.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from ..parallel_map import parallel_map
-from .every_frame import in_common, residual
+from .every_frame import in_common, residual, weighted_together
 from .frame_errors import ForceErrors, force_errors
-from .frame_likelihood import N_FIELDS, FrameLikelihood, with_force_sd
+from .frame_likelihood import N_FIELDS, FrameLikelihood, with_force_sd, with_noise
 from .gauss_newton import Weighed, evaluated
+from .likeliest_noise import likeliest_noise
 from .linear import WeightedResiduals
-from .noise_scales import log_prior
+from .noise_scales import LOG_RANGE, largest_variance, likeliest_variance, log_prior
 from .normal_equations import pull_sum, tool_sum
 from .problem import AMPLITUDE, Point, Problem
 
@@ -36,11 +35,6 @@ MIN_DETERMINED = 1e-3
 """Lower bound of the share of the force errors that the frames determine, by which steps are divided."""
 PRIOR_STEP = 1e-4
 """Change of the logarithm of a variance in the difference that is the slope of its prior."""
-WALK_TOLERANCE = 0.02
-"""Tolerance of the logarithm of the variance of the walk's steps, each value of which costs a pass over all frames."""
-LOG_RANGE = (-3.0, 14.0)
-"""Range of the logarithms of all variances [nat]. Where a sheet was measured in one plane, or the tool is the mean of
-what it holds, some residuals are 0, and the likelihood would rise towards a variance of 0."""
 
 
 def with_likeliest_scales(at: Weighed) -> Weighed:
@@ -67,7 +61,7 @@ def with_likeliest_scales(at: Weighed) -> Weighed:
 
 def likelier_force(problem: Problem, errors: ForceErrors) -> float:
     """Return the logarithm of a likelier variance of force errors, over the assumed one, from what all frames say."""
-    return float(np.log(_likeliest(float(errors.squared) * problem.scales.force, float(errors.degrees))))
+    return float(np.log(likeliest_variance(float(errors.squared) * problem.scales.force, float(errors.degrees))))
 
 
 def force_slope(problem: Problem, errors: ForceErrors) -> float:
@@ -103,29 +97,32 @@ def with_likeliest_others(at: Weighed) -> Weighed:
 def _with_likeliest_others(
     problem: Problem, point: Point, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
 ) -> Weighed:
-    problem = problem.with_scales(replace(problem.scales, walk=_likeliest_walk(problem, weights, residuals)))
+    problem, weights, residuals = _with_likeliest_noise(problem, weights, residuals)
     scales, with_force = problem.scales, problem.with_force(weights)
     scales = replace(
         scales,
         fields=_likeliest_fields(problem, weights, residuals),
-        tool=_likeliest(tool_sum(problem, residuals), 3 * len(weights)),
-        pull=_likeliest(pull_sum(problem, residuals), 3 * with_force) if with_force else scales.pull,
+        tool=likeliest_variance(tool_sum(problem, residuals), 3 * len(weights)),
+        pull=likeliest_variance(pull_sum(problem, residuals), 3 * with_force) if with_force else scales.pull,
     )
     return evaluated(problem.with_scales(scales), point, weights, residuals)
 
 
-def _likeliest_walk(
+def _with_likeliest_noise(
     problem: Problem, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
-) -> float:
-    """Return the likeliest variance of the steps of the tracker's walk, over the assumed one."""
-    if not problem.noise.size:
-        return problem.scales.walk
+) -> tuple[Problem, dict[int, FrameLikelihood], dict[int, WeightedResiduals]]:
+    """Return what there is with the likeliest autocorrelation of the errors and variance of the smooth noise."""
+    scales = likeliest_noise(problem, weights, residuals)
+    factor = jnp.asarray((scales.smooth / problem.scales.smooth) ** 0.5)
+    problem = problem.with_scales(scales)
 
-    def log_likelihood(variance: float) -> float:
-        with_walk = problem.with_scales(replace(problem.scales, walk=variance))
-        return -0.5 * sum(one.misfit + one.log_det for one in in_common(with_walk, weights, residuals))
+    def one(k: int) -> FrameLikelihood:
+        before = problem.before(k, weights)
+        kept, new = problem.autocorrelation(k, before), problem.new(k, before)
+        return with_noise(weights[k], factor, jnp.asarray(kept), jnp.asarray(new))
 
-    return _largest(log_likelihood, tolerance=WALK_TOLERANCE)
+    changed = parallel_map(one, weights)
+    return problem, changed, weighted_together(problem, changed, {k: found.own for k, found in residuals.items()})
 
 
 def _likeliest_fields(
@@ -143,18 +140,4 @@ def _likeliest_fields(
         each = 1 + square * np.array(eigenvalues)
         return 0.5 * float(np.sum(square * np.array(along) / each - np.log(each)))
 
-    return _largest(log_likelihood)
-
-
-def _likeliest(squared: float, degrees: float) -> float:
-    """Return the likeliest variance of a number of residuals, from their squared sum."""
-    return _largest(lambda variance: -0.5 * (squared / variance + degrees * float(np.log(variance))))
-
-
-def _largest(log_likelihood: Callable[[float], float], tolerance: float = 1e-5) -> float:
-    """Return the variance of largest posterior, up to a tolerance of its logarithm."""
-
-    def minus(log_variance: float) -> float:
-        return -log_likelihood(float(np.exp(log_variance))) - log_prior(float(np.exp(log_variance)))
-
-    return float(np.exp(minimize_scalar(minus, bounds=LOG_RANGE, method="bounded", options={"xatol": tolerance}).x))
+    return largest_variance(log_likelihood)

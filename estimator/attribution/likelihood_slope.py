@@ -1,18 +1,19 @@
 """The slope of the whole log likelihood by the effects' parameters: that of residuals, weights and determinants.
 
-Given the noise n_y of the positions and the amplitudes a, w and c of the smooth noise, of the tracker's walk and of the
-smooth force fields, the force error is
+Given the noise n_y of the positions and the amplitudes a and c of the smooth noise and of the smooth force fields, the
+force error is
 
-    f = H (y - h(x) + F (a + w) - n_y) + r + Q c,    f ~ N(0, T^2),
+    f = i + H (F a - n_y) + Q c,    f ~ N(0, T^2),
 
-and the positions have no other error. So by Fisher's identity the slope of the marginal likelihood is the mean of that
-of this one, over what the frames say of n_y, a, w and c,
+with i the innovation of H e + r, e = y - h(x), and the positions have no other error. So by Fisher's identity the slope
+of the marginal likelihood is the mean of that of this one, over what the frames say of n_y, a and c,
 
     -d ln p(y) = d [E |f|^2 / T^2 + ln |T^2| - ln |H^T H|] / 2
 
 [Dempster, Laird and Rubin 1977, JRSS B 39:1; Cappe, Moulines and Ryden 2005, doi:10.1007/0-387-28982-8, section 10.1].
-With the mean and the covariance held, that takes one reverse pass. H, T, Q and h depend on the parameters theta and on
-the predicted state x, which itself depends on theta. As r = 0 for it, springs to the grip included,
+With the mean and the covariance held, that takes one reverse pass. e is in the innovation of the next frame too. H, T,
+Q and h depend on the parameters theta and on the predicted state x, which itself depends on theta. As r = 0 for it,
+springs to the grip included,
 
     dL/dtheta = (dL/dtheta)_x - lambda . (dr/dtheta)_x,    H^T lambda = (dL/dx)_theta
 
@@ -31,12 +32,14 @@ from jaxtyping import Array, Float
 
 from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
+from ..parallel_map import parallel_map
 from ..physics.block_tridiagonal import inverse_band, window_sums
 from .every_frame import each_frame
 from .frame_errors import CommonAmplitudes, ForceErrors, common_amplitudes, frame_errors
 from .frame_likelihood import FrameLikelihood, around, seen_noise
 from .gauss_newton import Fitted, Weighed
 from .grasped_frames import ClosedFrame
+from .linear import WeightedResiduals
 from .normal_equations import tool_products
 from .sheet import PredictedSheet, gripped_forces
 from .tool_pull import adjoint
@@ -59,13 +62,42 @@ def likelihood_slopes(at: Weighed) -> dict[int, FrameSlope]:
     The residuals of the tool and of its force are not in it, as their weights do not change.
     """
     theta, noise, amplitudes = jnp.asarray(at.point.theta), jnp.asarray(at.problem.noise), common_amplitudes(at)
+    residuals, nothing = at.residuals, jnp.zeros_like(at.problem.history.rest)
+
+    def passed_on(k: int) -> Float[Array, "n 3"]:
+        return _of_before(at.weights[k], residuals[k].innovation, amplitudes[k])
+
+    of_before = parallel_map(passed_on, at.weights)
+    of_next = {at.problem.before(k, at.weights): slope for k, slope in of_before.items()}
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameSlope:
-        e = at.residuals[k].forces
-        found = frame_slope(at.problem.sheet, at.weights[k], theta, frame, context, x, e, noise, amplitudes[k])
+        found = frame_slope(
+            at.problem.sheet,
+            at.weights[k],
+            theta,
+            frame,
+            context,
+            x,
+            residuals[k],
+            noise,
+            amplitudes[k],
+            of_next.get(k, nothing),
+        )
         return jax.block_until_ready(found)
 
     return each_frame(at.problem, at.point, at.weights, one)
+
+
+@eqx.filter_jit
+def _of_before(
+    likelihood: FrameLikelihood, i: Float[Array, "n 3"], amplitudes: CommonAmplitudes
+) -> Float[Array, "n 3"]:
+    """Return the slope of a frame's -ln likelihood by the residual e of the frame before it [nat/m]."""
+    z = i + likelihood.fields @ amplitudes.mean
+    white = likelihood.whitened(z[:, :, None])[:, :, 0]
+    a = jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nic,ni->c", likelihood.noise, z))
+    pulled = likelihood.balance.transposed(likelihood.frame.dr_dx, white - likelihood.noise @ a)
+    return likelihood.innovation(jnp.zeros_like(z), pulled)
 
 
 def whole_slope(fitted: Fitted, of_frames: dict[int, FrameSlope]) -> Float[np.ndarray, " k"]:
@@ -85,30 +117,33 @@ def frame_slope(
     frame: ClosedFrame,
     context: FrameContext,
     x: Float[Array, "n 3"],
-    e: Float[Array, "n 3"],
+    residuals: WeightedResiduals,
     noise: Float[Array, "n modes"],
     amplitudes: CommonAmplitudes,
+    of_next: Float[Array, "n 3"],
 ) -> FrameSlope:
     """Return one frame's slope of -ln likelihood by s and theta at its predicted state x [nat].
 
-    `e` are the forces H (y - h(x)) + r there [N], `noise` the smooth noise's fields [m].
+    `noise` are the smooth noise's fields [m], `of_next` is the slope of the next frame's -ln likelihood by e [nat/m].
     """
     s, known = likelihood.frame.s, likelihood.frame.weight > 0
-    errors = frame_errors(likelihood, seen_noise(frame, noise), e, amplitudes)
+    errors = frame_errors(likelihood, seen_noise(frame, noise), residuals.innovation, amplitudes)
     of_square = inverse_band(likelihood.square_factor())
 
     def expected(theta: Float[Array, " p"], s: Float[Array, " n"], x: Float[Array, "n 3"]):
         balance, linear, Q = around(sheet, theta, s, frame, context, x)
         model = sheet.model(theta, context, frame.displacement)
-        positions = errors.positions.at[:, :, 0].add(likelihood.seen[:, None] * (frame.y - look(model, x)))
-        f = each(partial(balance.apply, linear.dr_dx), positions) + Q @ errors.amplitudes
-        f = f.at[:, :, 0].add(linear.unbalanced)
+        seen = likelihood.seen[:, None] > 0
+        e = jnp.where(seen, frame.y - look(model, x), residuals.own.positions)
+        now, before = (balance.apply(linear.dr_dx, one) for one in (e, residuals.before))
+        f = each(partial(balance.apply, linear.dr_dx), errors.positions) + Q @ errors.amplitudes
+        f = f.at[:, :, 0].add(likelihood.innovation(now + linear.unbalanced, before))
         left = window_sums(balance.layout, errors.position_covariance, balance.places, linear.dr_dx)
         squared = left + jnp.sum(f**2, axis=(1, 2))
         weight = jnp.where(known, linear.weight, 1.0)
         log_square = window_sums(balance.layout, of_square, balance.places, likelihood.inner(linear.dr_dx))
         total = 0.5 * jnp.sum(jnp.where(known, weight * squared - 3 * jnp.log(weight) - log_square, 0.0))
-        return total, ForceErrors.of(likelihood, f, left)
+        return total + jnp.sum(of_next * e), ForceErrors.of(likelihood, f, left)
 
     (along_theta, along_s, along_x), found = jax.grad(expected, argnums=(0, 1, 2), has_aux=True)(theta, s, x)
     balance_slope = adjoint(likelihood.balance, likelihood.frame, along_x[:, :, None])[:, :, 0]

@@ -1,16 +1,16 @@
 """Split the log likelihood of a fit exactly over its frames and particles.
 
-With the smooth force fields c, the tracker's walk w and the tool's offset o of each grasp at their likeliest values
-(see `frame_likelihood`),
-C the covariance of e, t the tool's residual and v the variance of its scale, frame k has
+With the smooth force fields c and the tool's offset o of each grasp at their likeliest values, i the innovation of the
+frame's forces and C its covariance with m coordinates observed (see `frame_likelihood`), t the tool's residual and v
+the variance of its scale, frame k has
 
-    -1/2 [z^T C^-1 z + ln |C| - 2 ln |H| + |t - o|^2 / v + 3 ln v],   z = e + Q c + H F w,
+    -1/2 [z^T C^-1 z + ln |C| - 2 ln |H| + m ln (1 - rho^2) + |t - o|^2 / v + 3 ln v],   z = i + Q c,
 
 and each grasp, for what its frames share,
 
-    -1/2 [|c|^2 / amplitude^2 + w^T W^-1 w + ln |P| + |o|^2 / (ratio v)],
+    -1/2 [|c|^2 / amplitude^2 + ln |P| + |o|^2 / (ratio v)],
 
-with W the prior covariance of the walk and P the precision of c and w by prior and frames, over that by the prior.
+with P the precision of c by prior and frames, over that by the prior.
 
 z^T C^-1 z is the least of what force errors f, noise d of single positions and noise a of neighbours together cost if
 z = f + H d + H F a:
@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 
 from ..parallel_map import parallel_map
 from .frame_errors import common_amplitudes
-from .frame_likelihood import N_FIELDS, FrameLikelihood, seen_noise
+from .frame_likelihood import FrameLikelihood
 from .gauss_newton import Weighed
 from .normal_equations import common, offset_share
 from .tool_pull import pull_products
@@ -47,7 +47,7 @@ class LikelihoodSplit:
     """Part of each frame that belongs to no particle: the tool's reports and force, and the noise that neighbours
     share."""
     grasps: float
-    """What belongs to no frame: the fields, the walk and the offsets that the frames of a grasp share."""
+    """What belongs to no frame: the fields and the offsets that the frames of a grasp share."""
 
     @property
     def frames(self) -> Float[np.ndarray, " frames"]:
@@ -62,29 +62,26 @@ def likelihood_split(fit: Weighed) -> LikelihoodSplit:
     likeliest, tool, grasps = common_amplitudes(fit), dict[int, float](), 0.0
     for frames in problem.by_grasp(weights).values():
         known = common(problem, weights, every, frames)
-        reports = np.array([np.asarray(every[k].tool) for k in frames])
+        reports = np.array([np.asarray(every[k].own.tool) for k in frames])
         ratio, share = offset_share(problem.history.frames[frames[0]].frame, len(frames))
         offset = share * reports.sum(axis=0)
         for k, apart in zip(frames, reports - offset, strict=True):
             tool[k] = -0.5 * float(apart @ apart / variance + 3 * np.log(variance))
         if problem.scales.pull is not None and problem.with_force(frames):
-            pulls = np.array([np.asarray(every[k].pull)[:, None] for k in frames])
+            pulls = np.array([np.asarray(every[k].own.pull)[:, None] for k in frames])
             for k, own in zip(frames, pulls[:, :, 0], strict=True):
                 constant = 3 * problem.with_force([k]) * np.log(problem.scales.pull)
                 tool[k] -= 0.5 * float(own @ own / problem.scales.pull + constant)
             whole = pull_products(pulls, [problem.history.frames[k].frame for k in frames])[0, 0]
             grasps -= 0.5 * float(whole - np.sum(pulls**2)) / problem.scales.pull
-        amplitudes = np.array([np.asarray(likeliest[k].mean) for k in frames])
-        c, steps = amplitudes[0, :N_FIELDS], np.diff(amplitudes[:, N_FIELDS:], axis=0, prepend=0)
-        walked = float(np.sum(np.sum(steps**2, axis=1) / problem.walk_variances(frames))) if steps.size else 0.0
+        c = np.asarray(likeliest[frames[0]].mean)
         of_offset = float(offset @ offset) / (ratio * variance)
-        grasps -= 0.5 * (float(c @ c) / problem.amplitude**2 + walked + known.log_det + of_offset)
+        grasps -= 0.5 * (float(c @ c) / problem.amplitude**2 + known.log_det + of_offset)
 
     def one(k: int) -> tuple[Float[np.ndarray, " n"], float]:
         seen = np.asarray(weights[k].seen)
         even = float(weights[k].log_determinant()) * seen / max(seen.sum(), 1.0)
-        smooth_noise = seen_noise(problem.history.frames[k].frame, jnp.asarray(problem.noise))
-        squares, smooth = _squares(weights[k], smooth_noise, every[k].forces, likeliest[k].mean)
+        squares, smooth = _squares(weights[k], every[k].innovation, likeliest[k].mean)
         return -0.5 * (np.asarray(squares) + even), tool[k] - 0.5 * float(smooth)
 
     found = parallel_map(one, weights)
@@ -97,15 +94,11 @@ def likelihood_split(fit: Weighed) -> LikelihoodSplit:
 
 @eqx.filter_jit
 def _squares(
-    likelihood: FrameLikelihood,
-    smooth_noise: Float[Array, "n 3 m"],
-    e: Float[Array, "n 3"],
-    amplitudes: Float[Array, " k"],
+    likelihood: FrameLikelihood, i: Float[Array, "n 3"], c: Float[Array, " q"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Return the terms of z^T C^-1 z: of each particle, and |a|^2."""
     balance, frame = likelihood.balance, likelihood.frame
-    c, w = amplitudes[:N_FIELDS], amplitudes[N_FIELDS:]
-    z = e + likelihood.fields @ c + balance.apply(frame.dr_dx, smooth_noise @ w)
+    z = i + likelihood.fields @ c
     white = likelihood.whitened(z[:, :, None])[:, :, 0]
     a = jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nic,ni->c", likelihood.noise, z))
     weighted = white - likelihood.noise @ a  # w f, and R^-1 d = H^T w f

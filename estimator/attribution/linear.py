@@ -2,10 +2,12 @@
 
 With the terms of `frame_likelihood`, at the bounded stiffnesses s and the parameters theta,
 
-    e + r + D ds + G dtheta + Q c + H F (w + a) = n
+    H e + r + D ds + G dtheta
 
-where r = 0 but for rounding. a is eliminated frame by frame, w and c grasp by grasp. At a noisy state instead of the
-predicted one this would be an errors-in-variables problem, with false effects.
+are the forces, where r = 0 but for rounding. What counts are their innovations, with those of the frame before as if
+its H were the same. The amplitudes a are eliminated frame
+by frame, c grasp by grasp. At a noisy state instead of the predicted one this would be an errors-in-variables problem,
+with false effects.
 """
 
 from functools import partial
@@ -29,29 +31,42 @@ GRASP_SD = 5e-4
 
 
 class NormalEquations(eqx.Module):
-    """One frame's normal equations over s, then theta in given directions, then c, then w, then -1 for e itself."""
+    """One frame's normal equations over s, then theta in given directions, then c, then -1 for e itself."""
 
     square: Float[Array, "k k"]
-    """Normal equations, k = n + directions + fields + shifts + 1."""
+    """Normal equations, k = n + directions + fields + 1."""
     tool: Float[Array, "3 j"]
-    """Rows of the tool's residual, over theta, c and w (zero) and e, in units of `tool_sd`."""
+    """Rows of the tool's residual, over theta, c (zero) and e, in units of `tool_sd`."""
     pull: Float[Array, "3 k"] | None = None
     """Rows of the residual of the tool's force, in units of its sd; None where no frame has a measured one."""
+
+
+class Residuals(eqx.Module):
+    """A frame's residuals at a predicted state."""
+
+    positions: Float[Array, "n 3"]
+    """Observed less predicted positions of particles that are seen, 0 of the others [m]."""
+    unbalanced: Float[Array, "n 3"]
+    """Forces r that do not balance [N]."""
+    tool: Float[Array, " 3"]
+    """Residual of the tool, in units of `tool_sd`."""
+    pull: Float[Array, " 3"] | None = None
+    """Residual of the tool's force, in units of its sd; None where no frame has a measured one."""
 
 
 class WeightedResiduals(eqx.Module):
     """A frame's residuals under given weights."""
 
-    forces: Float[Array, "n 3"]
-    """e itself [N]."""
+    own: Residuals
+    """The residuals e; positions that are not seen are as the last frame of the grasp had them."""
+    before: Float[Array, "n 3"]
+    """Those positions in the frame before; 0 where there is none [m]."""
+    innovation: Float[Array, "n 3"]
+    """Innovation of the forces H e + r [N]."""
     squared: Float[Array, ""]
-    """Squared norm of e under the weights."""
-    common: Float[Array, " k"]
-    """Inner products of e with the columns that frames have in common; see `FrameLikelihood.among`."""
-    tool: Float[Array, " 3"]
-    """Residual of the tool, in units of `tool_sd`."""
-    pull: Float[Array, " 3"] | None = None
-    """Residual of the tool's force, in units of its sd; None where no frame has a measured one."""
+    """Squared norm of the innovation under the weights."""
+    common: Float[Array, " q"]
+    """Inner products of the innovation with the smooth force fields."""
 
 
 def tool_sd(frame: ClosedFrame) -> Float[Array, ""]:
@@ -64,24 +79,53 @@ def grasp_sd(frame: ClosedFrame) -> Float[Array, ""]:
     return jnp.hypot(GRASP_SD, frame.held_sd)
 
 
+class Columns(eqx.Module):
+    """By what a frame's residuals change at the state where its weights were computed."""
+
+    of_s: Float[Array, "n 3"]
+    """D, the change of the forces on each particle with its own s [N]."""
+    of_theta: Float[Array, "n 3 d"]
+    """G, the change of all forces with the parameters in some directions [N]."""
+    tool: Float[Array, "3 d"]
+    """Change of the tool's residual, in units of `tool_sd`."""
+    pull: Float[Array, "3 k"] | None = None
+    """Rows of the residual of the tool's force, over s, theta, c (zero) and e, in units of its sd."""
+
+
 def normal_equations(
+    likelihood: FrameLikelihood, columns: Columns, before: Columns | None, residuals: WeightedResiduals
+) -> NormalEquations:
+    """Return a frame's normal equations, from its columns and from those of the frame before it in the grasp."""
+    of_s, of_theta = (
+        likelihood.innovation(now, jnp.zeros_like(now) if last is None else last)
+        for now, last in (
+            (columns.of_s, None if before is None else before.of_s),
+            (columns.of_theta, None if before is None else before.of_theta),
+        )
+    )
+    beyond = jnp.concatenate([of_theta, residuals.innovation[:, :, None]], axis=2)
+    tool = jnp.concatenate([columns.tool, _no_common(likelihood), residuals.own.tool[:, None]], axis=1)
+    return NormalEquations(square=_inner_products(likelihood, of_s, beyond), tool=tool, pull=columns.pull)
+
+
+def columns_of(
     sheet: PredictedSheet,
     likelihood: FrameLikelihood,
     theta: Float[Array, " p"],
     directions: Float[Array, "p d"],
     frame: ClosedFrame,
     context: FrameContext,
-) -> NormalEquations:
-    """Return a frame's normal equations at the state where its weights were computed."""
-    columns, tool = _columns(sheet, likelihood, theta, directions, frame, context)
+) -> Columns:
+    """Return by what a frame's residuals change at the state where its weights were computed."""
+    of_theta, tool = _parameter_columns(sheet, likelihood, theta, directions, frame, context)
     pull = None
     if frame.pull is not None:
         pull = _pull_rows(sheet, likelihood, theta, directions, frame, context)
-    return NormalEquations(square=_inner_products(likelihood, columns), tool=tool, pull=pull)
+    return Columns(of_s=likelihood.frame.dr_ds, of_theta=of_theta, tool=tool, pull=pull)
 
 
 @eqx.filter_jit
-def misfit(
+def residuals_of(
     sheet: PredictedSheet,
     likelihood: FrameLikelihood,
     theta: Float[Array, " p"],
@@ -89,16 +133,14 @@ def misfit(
     frame: ClosedFrame,
     context: FrameContext,
     x: Float[Array, "n 3"],
-) -> WeightedResiduals:
-    """Return the weighted residuals of another prediction x of the same frame.
+) -> Residuals:
+    """Return the residuals of another prediction x of the same frame.
 
     Forces that do not balance there count too: where a material is unstable, no equilibrium is found.
     """
     model = sheet.model(theta, context, frame.displacement)
     unbalanced = sheet.balance.with_energy(model.energy).unbalanced(x, s)
-    forces = likelihood.forces(frame.y - look(model, x)) + unbalanced
-    e = forces[:, :, None]
-    products = likelihood.dot(jnp.concatenate([likelihood.fields, e], axis=2), e, likelihood.whitened(e))[:, 0]
+    positions = likelihood.seen[:, None] * (frame.y - look(model, x))
     tool = tool_residual(sheet, model, theta, frame, context, x) / tool_sd(frame)
     pull = None
     if frame.pull is not None and likelihood.adjoint is not None:
@@ -106,32 +148,28 @@ def misfit(
         off = jnp.where(frame.held[:, None], 0.0, unbalanced)
         predicted = predicted - jnp.einsum("nic,ni->c", likelihood.adjoint, off)
         pull = frame.pull.weight * (predicted - frame.pull.force)
-    common = jnp.concatenate([products[:-1], likelihood.shift_products(e)[:, 0]])
-    return WeightedResiduals(forces=forces, squared=products[-1], common=common, tool=tool, pull=pull)
-
-
-def parameter_forces(
-    sheet: PredictedSheet,
-    likelihood: FrameLikelihood,
-    theta: Float[Array, " p"],
-    directions: Float[Array, "p d"],
-    frame: ClosedFrame,
-    context: FrameContext,
-) -> Float[Array, "n 3 d"]:
-    """Return G, the forces by which a change of the parameters moves what is observed, at the likelihood's state."""
-    return _columns(sheet, likelihood, theta, directions, frame, context)[0][:, :, :-1]
+    return Residuals(positions=positions, unbalanced=unbalanced, tool=tool, pull=pull)
 
 
 @eqx.filter_jit
-def _columns(
+def weighted_residuals(likelihood: FrameLikelihood, own: Residuals, before: Float[Array, "n 3"]) -> WeightedResiduals:
+    """Return weighted residuals, from those of the frame and the positions of the one before."""
+    now = likelihood.forces(own.positions) + own.unbalanced
+    i = likelihood.innovation(now, likelihood.forces(before))[:, :, None]
+    products = likelihood.dot(jnp.concatenate([likelihood.fields, i], axis=2), i, likelihood.whitened(i))[:, 0]
+    return WeightedResiduals(own=own, before=before, innovation=i[:, :, 0], squared=products[-1], common=products[:-1])
+
+
+@eqx.filter_jit
+def _parameter_columns(
     sheet: PredictedSheet,
     likelihood: FrameLikelihood,
     theta: Float[Array, " p"],
     directions: Float[Array, "p d"],
     frame: ClosedFrame,
     context: FrameContext,
-) -> tuple[Float[Array, "n 3 j"], Float[Array, "3 k"]]:
-    """Return G along some directions and e as columns, and the rows of the tool's residual for G, Q, H F and e."""
+) -> tuple[Float[Array, "n 3 d"], Float[Array, "3 d"]]:
+    """Return G along some directions, and the change of the tool's residual."""
     balance, linear = likelihood.balance, likelihood.frame
     x, s = linear.x, linear.s
 
@@ -142,13 +180,8 @@ def _columns(
         return unbalanced, look(changed, x), tool_residual(sheet, changed, to, frame, context, x)
 
     dforce, dview, dtool = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
-    model = sheet.model(theta, context, frame.displacement)
-    e = likelihood.forces(frame.y - look(model, x)) + linear.unbalanced
     seen = each(partial(balance.apply, linear.dr_dx), seen_shift(frame, dview))
-    tool = jnp.concatenate(
-        [dtool, _no_common(likelihood), tool_residual(sheet, model, theta, frame, context, x)[:, None]], axis=1
-    )
-    return jnp.concatenate([dforce - seen, e[:, :, None]], axis=2), tool / tool_sd(frame)
+    return dforce - seen, dtool / tool_sd(frame)
 
 
 @eqx.filter_jit
@@ -160,7 +193,7 @@ def _pull_rows(
     frame: ClosedFrame,
     context: FrameContext,
 ) -> Float[Array, "3 k"]:
-    """Return the rows of the residual of the tool's force, over s, theta in directions, c and w (zero) and e."""
+    """Return the rows of the residual of the tool's force, over s, theta in directions, c (zero) and e."""
     assert frame.pull is not None and likelihood.adjoint is not None
     balance, linear, adjoint = likelihood.balance, likelihood.frame, likelihood.adjoint
     x, s = linear.x, linear.s
@@ -186,10 +219,11 @@ def _no_common(likelihood: FrameLikelihood) -> Float[Array, "3 k"]:
 
 
 @eqx.filter_jit
-def _inner_products(likelihood: FrameLikelihood, beyond: Float[Array, "n 3 j"]) -> Float[Array, "_k _k"]:
-    """Return the inner products of the columns of D (one a particle), G, Q, H F and e; `beyond` holds G and e."""
-    frame, d = likelihood.frame, beyond.shape[2] - 1
-    slope, white = frame.dr_ds, likelihood.whitened(beyond)
+def _inner_products(
+    likelihood: FrameLikelihood, slope: Float[Array, "n 3"], beyond: Float[Array, "n 3 j"]
+) -> Float[Array, "_k _k"]:
+    """Return the inner products of the columns of D (one a particle), G, Q and e; `beyond` holds G and e."""
+    frame, d, white = likelihood.frame, beyond.shape[2] - 1, likelihood.whitened(beyond)
     shared = jnp.einsum("ni,nic->cn", slope, likelihood.noise)
     solved = jax.scipy.linalg.cho_solve((likelihood.spread, True), shared)
     own = likelihood.balance.precision_along(frame, slope) - shared.T @ solved
@@ -201,8 +235,8 @@ def _inner_products(likelihood: FrameLikelihood, beyond: Float[Array, "n 3 j"]) 
         return jnp.concatenate([of_beyond[:, :d], of_common, of_beyond[:, d:]], axis=1)
 
     fields = likelihood.fields
-    common = jnp.concatenate([likelihood.dot(fields, beyond, white), likelihood.shift_products(beyond)])
+    common = likelihood.dot(fields, beyond, white)
     whole = joined(likelihood.dot(beyond, beyond, white), common.T)
     among = jnp.concatenate([whole[:d], joined(common, likelihood.among), whole[d:]])
-    between = joined(of_slope(beyond, white), jnp.concatenate([of_slope(fields, likelihood.white), solved.T], axis=1))
+    between = joined(of_slope(beyond, white), of_slope(fields, likelihood.white))
     return jnp.block([[own, between], [between.T, among]])

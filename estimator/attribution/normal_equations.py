@@ -11,20 +11,19 @@ from .grasped_frames import ClosedFrame
 from .linear import NormalEquations, WeightedResiduals, grasp_sd, tool_sd
 from .problem import Problem
 from .tool_pull import pull_products
-from .tracker_walk import without_walk
 
 
 class Common(NamedTuple):
     """What the residuals of a grasp's frames say of what these have in common."""
 
     squared: float
-    """Sum of the squared residuals, with the walk eliminated [nat, doubled]."""
+    """Sum of the squared residuals [nat, doubled]."""
     precision: Float[np.ndarray, "q q"]
     """Precision of the amplitudes c of its smooth force fields."""
     products: Float[np.ndarray, " q"]
     """Inner products of the fields with the residuals: the likeliest c are minus these, over the precision."""
     log_det: float
-    """ln of the volume of the walk and of c by their prior, over that by the frames [nat, doubled]."""
+    """ln of the volume of c by its prior, over that by the frames [nat, doubled]."""
 
     @property
     def misfit(self) -> float:
@@ -36,45 +35,23 @@ def common(
     problem: Problem, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals], frames: list[int]
 ) -> Common:
     """Return what the residuals of a grasp's frames say of its fields."""
-    among, beside = common_products(weights, residuals, frames)
-    total = np.zeros((N_FIELDS + 1, N_FIELDS + 1))
-    total[:-1, :-1] = np.sum(among[:, :N_FIELDS, :N_FIELDS], axis=0)
-    total[-1, :-1] = total[:-1, -1] = np.sum(beside[:, :N_FIELDS, -1], axis=0)
-    total[-1, -1] = sum(float(residuals[k].squared) for k in frames)
-    walk = without_walk(among[:, N_FIELDS:, N_FIELDS:], beside[:, N_FIELDS:], problem.walk_variances(frames))
-    total += walk.square
-    precision = total[:-1, :-1] + np.eye(N_FIELDS) / problem.amplitude**2
+    among = np.sum([np.asarray(weights[k].among) for k in frames], axis=0)
+    products = np.sum([np.asarray(residuals[k].common) for k in frames], axis=0)
+    precision = among + np.eye(N_FIELDS) / problem.amplitude**2
     with np.errstate(invalid="ignore"):  # where a point has no finite weights, the caller refuses it
-        of_fields = float(np.linalg.slogdet(problem.amplitude**2 * precision)[1])
-    return Common(squared=total[-1, -1], precision=precision, products=total[:-1, -1], log_det=walk.log_det + of_fields)
-
-
-def common_products(
-    weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals], frames: list[int]
-) -> tuple[Float[np.ndarray, "t k k"], Float[np.ndarray, "t k j"]]:
-    """Return the inner products of the columns that frames have in common, and those with the fields and e."""
-    among = np.array([np.asarray(weights[k].among) for k in frames])
-    e = np.array([np.asarray(residuals[k].common) for k in frames])
-    return among, np.concatenate([among[:, :, :N_FIELDS], e[:, :, None]], axis=2)
+        log_det = float(np.linalg.slogdet(problem.amplitude**2 * precision)[1])
+    squared = sum(float(residuals[k].squared) for k in frames)
+    return Common(squared=squared, precision=precision, products=products, log_det=log_det)
 
 
 def reduced(problem: Problem, equations: dict[int, NormalEquations], d: int) -> Float[np.ndarray, "k k"]:
     """Return the normal equations of all frames over s, the first d directions and -1."""
     total: np.ndarray | float = 0.0
-    shifts = 3 * problem.noise.shape[1]
     for frames in problem.by_grasp(equations).values():
-        every = np.array([np.asarray(equations[k].square) for k in frames])
-        size = every.shape[1]
-        n = size - equations[frames[0]].tool.shape[1]
-        first = size - 1 - shifts
-        left = np.r_[0 : n + d, first - N_FIELDS : first, size - 1]
-        walk = without_walk(
-            every[:, first:-1, first:-1], every[:, first:-1][:, :, left], problem.walk_variances(frames)
-        )
-        whole = every.sum(axis=0) + tool_products(problem, equations, frames)
-        whole = whole[np.ix_(left, left)] + walk.square
+        whole = sum(np.asarray(equations[k].square) for k in frames) + tool_products(problem, equations, frames)
+        n = len(whole) - equations[frames[0]].tool.shape[1]
         fields = slice(-1 - N_FIELDS, -1)
-        kept = np.r_[0 : n + d, len(left) - 1]
+        kept = np.r_[0 : n + d, len(whole) - 1]
         middle = whole[fields, fields] + np.eye(N_FIELDS) / problem.amplitude**2
         beside = whole[fields][:, kept]
         total = total + whole[np.ix_(kept, kept)] - beside.T @ np.linalg.solve(middle, beside)
@@ -101,7 +78,7 @@ def tool_sum(problem: Problem, residuals: dict[int, WeightedResiduals]) -> float
     """Return the sum of the tool's squared residuals over all frames, over the assumed variances."""
     total = 0.0
     for frames in problem.by_grasp(residuals).values():
-        rows = np.array([np.asarray(residuals[k].tool)[:, None] for k in frames])
+        rows = np.array([np.asarray(residuals[k].own.tool)[:, None] for k in frames])
         total += float(less_offset(rows, problem.history.frames[frames[0]].frame)[0, 0])
     return total
 
@@ -110,7 +87,7 @@ def pull_sum(problem: Problem, residuals: dict[int, WeightedResiduals]) -> float
     """Return the sum of the squared residuals of the tool's force over all frames, over the assumed variances."""
     total = 0.0
     for frames in problem.by_grasp(one for one in residuals if problem.with_force([one])).values():
-        rows = np.array([np.asarray(residuals[k].pull)[:, None] for k in frames])
+        rows = np.array([np.asarray(residuals[k].own.pull)[:, None] for k in frames])
         total += float(pull_products(rows, [problem.history.frames[k].frame for k in frames])[0, 0])
     return total
 

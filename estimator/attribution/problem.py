@@ -38,8 +38,6 @@ FORCE_VARIANCE = 0.012
 grasp. Measured: the likeliest on recordings of the reference with nothing undeclared."""
 AMPLITUDE = 0.365
 """Assumed sd of the smooth force fields [assumed force errors]; the likeliest on the same recordings."""
-WALK_STEP = 1e-6
-"""Assumed standard deviation of the step from frame to frame of what a tracker has a point drift by [m]."""
 SHEET_STRENGTH = 1e9
 """Attached neighbours that the whole sheet is worth [particles]; see `PriorConfig.sheet_strength`. Here all attachments
 resemble each other, as they did when the limits of the decisions were chosen."""
@@ -55,8 +53,8 @@ class Problem:
     """All frames."""
     prior: AttachmentBelief
     """Prior of the attachments."""
-    noise: Float[np.ndarray, "n modes"]
-    """Fields of the smooth noise of observed positions [m]."""
+    assumed_noise: Float[np.ndarray, "n modes"]
+    """Fields of the smooth noise of observed positions, of the assumed size [m]."""
     prior_sd: Float[np.ndarray, " p"]
     """Prior standard deviations of all the library's parameters as effects."""
     own: np.ndarray
@@ -71,7 +69,8 @@ class Problem:
     @property
     def assumed_scales(self) -> NoiseScales:
         """Return the sizes of the errors as they are assumed."""
-        return NoiseScales(pull=None if self.scales.pull is None else 1.0)
+        pull, noise = (None if one is None else 1.0 for one in (self.scales.pull, self.scales.noise))
+        return NoiseScales(pull=pull, noise=noise)
 
     def with_force(self, frames: Iterable[int]) -> int:
         """Return the number of some frames in which the force of the tool was measured."""
@@ -84,24 +83,27 @@ class Problem:
         return AMPLITUDE * (self.scales.fields / self.scales.force) ** 0.5
 
     @property
-    def walk_step(self) -> float:
-        """Return the standard deviation of the step from frame to frame of what the tracker drifts by [m]."""
-        return WALK_STEP * self.scales.walk**0.5
+    def noise(self) -> Float[np.ndarray, "n modes"]:
+        """Return the fields of the smooth noise of observed positions [m]."""
+        return self.assumed_noise * self.scales.smooth**0.5
 
-    @property
-    def drift_sd(self) -> float:
-        """Return the standard deviation of what the tracker has drifted by in the last frame [m]."""
-        return self.walk_step * max(self.history.frames[-1].index, 1) ** 0.5
+    def before(self, k: int, frames: Iterable[int]) -> int | None:
+        """Return the last of some frames that is before frame k in its grasp; None if there is none."""
+        grasp = self.history.frames[k].grasp
+        return max((j for j in frames if j < k and self.history.frames[j].grasp == grasp), default=None)
 
-    def walk_variances(self, frames: list[int]) -> Float[np.ndarray, " t"]:
-        """Return the variances of the steps of the tracker's walk to frames of a grasp, in amplitudes of the noise.
+    def frames_since(self, k: int, before: int | None) -> int:
+        """Return the number of frames of the recording from another one to frame k; from rest, its begin, if None."""
+        index = 0 if before is None else self.history.frames[before].index
+        return max(self.history.frames[k].index - index, 1)
 
-        The first is that from rest, the begin of the recording.
-        """
-        indices = [self.history.frames[k].index for k in frames]
-        steps = np.maximum(np.diff(indices, prepend=0), 1)
-        smooth = np.max(np.sum(self.noise**2, axis=1), initial=0.0)
-        return steps * (self.walk_step**2 / smooth if smooth else 0.0)
+    def new(self, k: int, before: int | None) -> float:
+        """Return the variance of what is new of the errors of frame k since another one, over the assumed one."""
+        return (self.scales.noise or 1.0) * (1 - self.autocorrelation(k, before) ** 2)
+
+    def autocorrelation(self, k: int, before: int | None) -> float:
+        """Return the autocorrelation of the errors of frame k and of another one, or of rest."""
+        return self.scales.persistence ** self.frames_since(k, before)
 
     @classmethod
     def build(cls, dataset: Dataset, library: tuple[Effect, ...]) -> "Problem":
@@ -124,12 +126,12 @@ class Problem:
             sheet=sheet,
             history=FrameHistory(dataset.frames, mesh.rest),
             prior=prior_belief(mesh, reference=float(balance.reference), config=alike, belief=config.belief),
-            noise=dataset.fields,
+            assumed_noise=dataset.fields,
             prior_sd=np.concatenate([np.ravel(effect.prior_sds) for effect in library]),
             own=np.concatenate([[], *(sheet.place(name) for name in own)]).astype(int),
             own_sd=np.concatenate([[], *(np.asarray(sd) for sd in own.values())]),
             force_sd=balance.force_sd,
-            scales=NoiseScales(pull=1.0 if forced else None),
+            scales=NoiseScales(pull=1.0 if forced else None, noise=None if dataset.noise.frames else 1.0),
         )
 
     def with_scales(self, scales: NoiseScales) -> "Problem":

@@ -71,7 +71,8 @@ def scores(fitted: Fitted) -> list[Score]:
     """Return the scores of all effects that are not in the fit, the likeliest first."""
     fitted = _with_usual_tool(fitted)
     problem, n = fitted.problem, len(fitted.site_precision)
-    equations = linearised(problem, fitted.point, fitted.weights, directions(problem, np.arange(problem.sheet.size)))
+    along = directions(problem, np.arange(problem.sheet.size))
+    equations = linearised(problem, fitted.point, fitted.weights, fitted.residuals, along)
     square = reduced(problem, equations, problem.sheet.size)
     left, whole = without_stiffnesses(square, fitted.site_precision), square[n:, n:]
     found = [

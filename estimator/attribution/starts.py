@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .every_frame import directions, linearised, weighed
+from .every_frame import directions, linearised, residual, weighed
 from .gauss_newton import (
     MAX_STIFFNESS,
     Fitted,
@@ -49,7 +49,9 @@ class ObservedStates:
         """Return the normal equations around some states with bounded stiffnesses s."""
         size = problem.sheet.size
         point = Point(theta=np.zeros(size), s=s, states=states, seen=states)
-        equations = linearised(problem, point, weighed(problem, point, frames), directions(problem, np.arange(size)))
+        weights = weighed(problem, point, frames)
+        every = residual(problem, weights, point)
+        equations = linearised(problem, point, weights, every, directions(problem, np.arange(size)))
         return cls(problem=problem, point=point, frames=frames, square=reduced(problem, equations, size))
 
     def starts(self, named: np.ndarray) -> list[Point]:

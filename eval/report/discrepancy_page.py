@@ -36,6 +36,8 @@ PREDICTED = {"before": BEFORE, "after": AFTER, "last_frame": WITHOUT_MODEL, "wit
 """Colours of the predictions of each frame of the part that chose no effect, by their keys."""
 PAGE_HEIGHT = 1250
 """Height of all pictures [px]."""
+PERSISTENT = 0.5
+"""Autocorrelation from which the page says that errors persist."""
 VERDICTS = {
     "no-effect": "These frames show no missing effect.",
     "effect": "An effect is named, and it explains the residual.",
@@ -77,7 +79,7 @@ def story(found: Mapping[str, Any]) -> list[str]:
             f"There are no still frames: noise of {1e3 * found['noise']['sd_m']:.2g} mm was assumed, and of "
             f"{1e3 * found['noise']['smooth_sd_m']:.2g} mm that neighbours share."
         )
-    sentences += _drift_sentences(found["noise"])
+    sentences += _persistence_sentences(found["noise"])
     if left_out := found["frames"]["left_out"]:
         sentences.append(
             f"{len(left_out)} frames of {len(left_out) + found['frames']['used']} are left out: the held tissue has "
@@ -86,14 +88,14 @@ def story(found: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
-def _drift_sentences(noise: Mapping[str, Any]) -> list[str]:
-    """Return how much the tracker drifts, if that is more than its noise."""
-    step, drift = noise["tracker_walk_m"], noise["tracker_drift_m"]
-    if not drift > np.hypot(noise["sd_m"], noise["smooth_sd_m"]):
+def _persistence_sentences(noise: Mapping[str, Any]) -> list[str]:
+    """Return how much the errors of a frame persist in the next one, if most of them do."""
+    if not noise["autocorrelation"] > PERSISTENT:
         return []
     return [
-        f"The tracker drifts: what it errs by changes by {1e3 * step:.2g} mm from frame to frame, alike for "
-        f"neighbours, and adds up to some {1e3 * drift:.2g} mm by the last one."
+        f"Errors persist, as where a tracker drifts: what points err by has a correlation of "
+        f"{noise['autocorrelation']:.2g} from one frame to the next, changes by {1e3 * noise['step_m']:.2g} mm a step "
+        f"and is some {1e3 * noise['whole_m']:.2g} mm by the last one."
     ]
 
 

@@ -39,7 +39,7 @@ def small_problem() -> Problem:
         sheet=PredictedSheet(balance=balance, view=centred(sheet()), library=LIBRARY),
         history=FrameHistory([timed], rest),
         prior=sheet_prior(),
-        noise=np.zeros((n, 0)),
+        assumed_noise=np.zeros((n, 0)),
         prior_sd=np.concatenate([np.ravel(effect.prior_sds) for effect in LIBRARY]),
         own=np.zeros(0, dtype=int),
         own_sd=np.zeros(0),

@@ -35,7 +35,7 @@ def test_the_parts_sum_to_the_log_likelihood_with_noise_that_neighbours_share(li
     fitted = light[0].declared.fitted
     fields = 1e-4 * np.stack([np.ones(len(fitted.point.s)), np.cos(1e2 * fitted.point.states[0, :, 0])], axis=1)
     with jax.enable_x64(True), one_thread():
-        noisy = weigh(replace(fitted.problem, noise=fields), fitted.point, list(fitted.weights)[:3])
+        noisy = weigh(replace(fitted.problem, assumed_noise=fields), fitted.point, list(fitted.weights)[:3])
         split = likelihood_split(noisy)
     assert split.frames.sum() + split.grasps == pytest.approx(noisy.log_likelihood, rel=ROUNDING)
 

@@ -24,15 +24,18 @@ RTOL, ATOL = 0.1, 0.05
 
 
 @pytest.mark.parametrize(
-    "shared", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["white noise", "noise that neighbours share"]
+    ("shared", "persistence"),
+    [(False, 0.5), pytest.param(True, 0.0, marks=pytest.mark.slow), pytest.param(True, 0.5, marks=pytest.mark.slow)],
+    ids=["white noise that persists", "noise that neighbours share", "noise that neighbours share and that persists"],
 )
-def test_the_slope_is_that_of_finite_differences(light, shared):
+def test_the_slope_is_that_of_finite_differences(light, shared, persistence):
     """The differences are of states that are predicted anew, so that weights and determinants change with them."""
     fitted = light[0].final.fitted
     problem, frames = fitted.problem, list(fitted.equations)[::3]
+    problem = problem.with_scales(replace(problem.scales, persistence=persistence))
     if shared:
         x = np.asarray(problem.sheet.balance.energy.rest)
-        problem = replace(problem, noise=2e-4 * np.column_stack([np.ones(len(x)), np.cos(30 * x[:, 0])]))
+        problem = replace(problem, assumed_noise=2e-4 * np.column_stack([np.ones(len(x)), np.cos(30 * x[:, 0])]))
     sd, free, s = problem.sd(fitted.named), fitted.free, fitted.point.s
     with jax.enable_x64(True), one_thread():
 
