@@ -72,11 +72,17 @@ def fit(
     return Fits(assumed=assumed, likeliest=likeliest)
 
 
-def fit_to_more(fits: Fits, frames: list[int]) -> Fits:
-    """Return fits to more frames, begun where they ended with errors of the likeliest size."""
+def fit_to_more(fits: Fits, frames: list[int], before: Fits | None) -> Fits:
+    """Return fits to more frames, with errors of the likeliest size.
+
+    They begin where the fits ended, or at the likeliest fit to all those frames without one of the effects, if the
+    normal equations promise more there.
+    """
     last = fits.likeliest
     begun = start(last.problem, last.point.theta, last.point.s, last.point.states, frames)
     now = _with_likeliest_scales(linearise_at(last.problem, last.named, begun, frames))
+    if before is not None:
+        now = max(now, linearised_fit(before.likeliest, last.named), key=promised_log_posterior)
     return fits._replace(likeliest=_refined(gauss_newton(now)))
 
 

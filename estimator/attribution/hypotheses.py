@@ -183,7 +183,8 @@ def with_declared(found: list[Hypothesis], again: Hypothesis) -> list[Hypothesis
 def of_all_frames(found: list[Hypothesis], frames: list[int], log: Log) -> list[Hypothesis]:
     """Return hypotheses, the declared model and those within reach of the likeliest fitted to all frames.
 
-    The evidence of the others is extrapolated: their lead over the declared model grows with the number of frames.
+    The evidence of the others is extrapolated: their lead over one that was fitted to all grows with the number of
+    frames. Of all such extrapolations the largest counts.
 
     Args:
         found: hypotheses that were searched for, the declared model first.
@@ -199,22 +200,26 @@ def of_all_frames(found: list[Hypothesis], frames: list[int], log: Log) -> list[
     def of_all(one: Hypothesis) -> Hypothesis:
         if one not in fitted:
             before = None if one.before is None else of_all(one.before)
-            result = hypothesis_of(fit_to_more(one.fits, frames), one.added, before)
+            fits = fit_to_more(one.fits, frames, None if before is None else before.fits)
+            result = hypothesis_of(fits, one.added, before)
             fitted[one] = replace(result, scores=one.scores)
             _report(fitted[one], log)
         return fitted[one]
 
     def estimated(one: Hypothesis) -> Hypothesis:
-        lead = more * (one.log_evidence - declared.log_evidence)
-        return fitted.get(one) or replace(one, log_evidence=of_all(declared).log_evidence + lead)
+        found = max(
+            of_all.log_evidence + more * (one.log_evidence - few.log_evidence) for few, of_all in fitted.items()
+        )
+        return fitted.get(one) or replace(one, log_evidence=found)
 
+    of_all(declared)
     while True:
-        now = [estimated(one) for one in found]
-        logs = [log_posterior(one.evidence, library) for one in now]
-        near = [one for one, value in zip(found, logs, strict=True) if value > max(logs) - REACH and one not in fitted]
+        now = {one: estimated(one) for one in found}
+        logs = {one: log_posterior(changed.evidence, library) for one, changed in now.items()}
+        near = [one for one in found if logs[one] > max(logs.values()) - REACH and one not in fitted]
         if not near:
-            return now
-        of_all(near[0])
+            return list(now.values())
+        of_all(max(near, key=lambda one: logs[one]))
 
 
 def likely(one: Hypothesis, log: Log) -> list[Score]:

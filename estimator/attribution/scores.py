@@ -35,9 +35,9 @@ from .problem import Point
 
 INITIAL_GUESS_STEPS = 2
 """Gauss-Newton steps of a fit from an initial guess of an effect."""
-MIN_SCORE = 5.0
-"""Log Bayes factor of one step from which an effect is fitted [nat]. On the arc the largest score where nothing is
-undeclared is 3.9, and the least of an effect that is named 7.7."""
+MIN_SCORE = 2.0
+"""Log Bayes factor of one step from which an effect is fitted [nat]. It is a lower bound of what a fit gains: the least
+of an effect that is named was 3.0."""
 MAX_START_MISFIT = 4.0
 """Largest misfit at an initial guess with which the fit is tried [misfits without the effect]."""
 SINGULAR = 1e-9

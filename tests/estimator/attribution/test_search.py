@@ -60,7 +60,7 @@ def refitted(monkeypatch: pytest.MonkeyPatch, evidences: dict[tuple[str, ...], f
         fitted.append(names)
         return hypothesis(*names, nat=evidences[names], before=before)
 
-    monkeypatch.setattr(hypotheses, "fit_to_more", lambda fits, frames: fits)
+    monkeypatch.setattr(hypotheses, "fit_to_more", lambda fits, frames, before: fits)
     monkeypatch.setattr(hypotheses, "hypothesis_of", made_up)
     return fitted
 
@@ -84,6 +84,15 @@ def test_what_comes_within_reach_once_the_best_is_fitted_is_fitted_too(monkeypat
     now = of_all_frames(found, [0, 1, 2], lambda text: None)
     assert fitted == [(), ("gravity",), ("bed",)]
     assert [one.log_evidence for one in now] == [0.0, 20.0, 90.0]
+
+
+def test_what_the_search_did_not_distinguish_from_the_best_is_fitted_too(monkeypatch):
+    """Although its lead over the declared model grew by more than that of the other one."""
+    fitted = refitted(monkeypatch, {(): 0.0, ("gravity",): 400.0, ("bed",): 410.0})
+    found = [nothing := hypothesis()]
+    found += [hypothesis(name, nat=nat, before=nothing) for name, nat in (("gravity", 50), ("bed", 49))]
+    now = of_all_frames(found, [0, 1, 2], lambda text: None)
+    assert fitted == [(), ("gravity",), ("bed",)] and now[2].log_evidence == 410.0
 
 
 def test_a_pair_is_fitted_to_all_frames_after_what_it_was_reached_through(monkeypatch):
