@@ -240,7 +240,7 @@ def responses(
         closed,
         problem.history.context(k, states),
     )
-    of_parameters = columns.of_theta[:, :, : len(fitted.free)]
+    of_parameters = columns.of_theta(likelihood)[:, :, : len(fitted.free)]
     by_s = np.einsum("ani,ni->an", by_force, np.asarray(likelihood.frame.dr_ds))
     by_theta = np.einsum("ani,nij->aj", by_force, np.asarray(of_parameters))
     return by_force, np.concatenate([by_s, by_theta], axis=1)

@@ -4,13 +4,11 @@ With the terms of `frame_likelihood`, at the bounded stiffnesses s and the param
 
     H e + r + D ds + G dtheta
 
-are the forces, where r = 0 but for rounding. What counts are their innovations, with those of the frame before as if
-its H were the same. The amplitudes a are eliminated frame
-by frame, c grasp by grasp. At a noisy state instead of the predicted one this would be an errors-in-variables problem,
-with false effects.
+are the forces, where r = 0 but for rounding. What counts are their innovations. In these H is that of the frame itself
+for what moves the view of both; what moves the state of the frame before counts as if its H were the same. The
+amplitudes a are eliminated frame by frame, c grasp by grasp. At a noisy state instead of the predicted one this would
+be an errors-in-variables problem, with false effects.
 """
-
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -84,28 +82,40 @@ class Columns(eqx.Module):
 
     of_s: Float[Array, "n 3"]
     """D, the change of the forces on each particle with its own s [N]."""
-    of_theta: Float[Array, "n 3 d"]
-    """G, the change of all forces with the parameters in some directions [N]."""
+    of_state: Float[Array, "n 3 d"]
+    """Change of all forces with the parameters in some directions, where these move the sheet [N]."""
+    of_view: Float[Array, "n 3 d"]
+    """By how much they move what is seen of the sheet where it is [m]."""
     tool: Float[Array, "3 d"]
     """Change of the tool's residual, in units of `tool_sd`."""
     pull: Float[Array, "3 k"] | None = None
     """Rows of the residual of the tool's force, over s, theta, c (zero) and e, in units of its sd."""
+
+    def of_theta(self, likelihood: FrameLikelihood) -> Float[Array, "n 3 d"]:
+        """Return G, the change of all forces with the parameters [N]."""
+        return self.of_state - each(likelihood.forces, self.of_view)
 
 
 def normal_equations(
     likelihood: FrameLikelihood, columns: Columns, before: Columns | None, residuals: WeightedResiduals
 ) -> NormalEquations:
     """Return a frame's normal equations, from its columns and from those of the frame before it in the grasp."""
-    of_s, of_theta = (
-        likelihood.innovation(now, jnp.zeros_like(now) if last is None else last)
-        for now, last in (
-            (columns.of_s, None if before is None else before.of_s),
-            (columns.of_theta, None if before is None else before.of_theta),
-        )
-    )
-    beyond = jnp.concatenate([of_theta, residuals.innovation[:, :, None]], axis=2)
+    last: Columns = jax.tree.map(jnp.zeros_like, columns) if before is None else before
     tool = jnp.concatenate([columns.tool, _no_common(likelihood), residuals.own.tool[:, None]], axis=1)
-    return NormalEquations(square=_inner_products(likelihood, of_s, beyond), tool=tool, pull=columns.pull)
+    square = _inner_products(likelihood, *_innovations(likelihood, columns, last, residuals.innovation))
+    return NormalEquations(square=square, tool=tool, pull=columns.pull)
+
+
+@eqx.filter_jit
+def _innovations(
+    likelihood: FrameLikelihood, columns: Columns, before: Columns, of_forces: Float[Array, "n 3"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 j"]]:
+    """Return the innovations of D, and of G and of the forces together."""
+    of_s, of_state, of_view = (
+        likelihood.innovation(getattr(columns, name), getattr(before, name)) for name in ("of_s", "of_state", "of_view")
+    )
+    of_theta = of_state - each(likelihood.forces, of_view)
+    return of_s, jnp.concatenate([of_theta, of_forces[:, :, None]], axis=2)
 
 
 def columns_of(
@@ -117,11 +127,11 @@ def columns_of(
     context: FrameContext,
 ) -> Columns:
     """Return by what a frame's residuals change at the state where its weights were computed."""
-    of_theta, tool = _parameter_columns(sheet, likelihood, theta, directions, frame, context)
+    of_state, of_view, tool = _parameter_columns(sheet, likelihood, theta, directions, frame, context)
     pull = None
     if frame.pull is not None:
         pull = _pull_rows(sheet, likelihood, theta, directions, frame, context)
-    return Columns(of_s=likelihood.frame.dr_ds, of_theta=of_theta, tool=tool, pull=pull)
+    return Columns(of_s=likelihood.frame.dr_ds, of_state=of_state, of_view=of_view, tool=tool, pull=pull)
 
 
 @eqx.filter_jit
@@ -168,10 +178,12 @@ def _parameter_columns(
     directions: Float[Array, "p d"],
     frame: ClosedFrame,
     context: FrameContext,
-) -> tuple[Float[Array, "n 3 d"], Float[Array, "3 d"]]:
-    """Return G along some directions, and the change of the tool's residual."""
-    balance, linear = likelihood.balance, likelihood.frame
-    x, s = linear.x, linear.s
+) -> tuple[Float[Array, "n 3 d"], Float[Array, "n 3 d"], Float[Array, "3 d"]]:
+    """Return the two parts of G along some directions, and the change of the tool's residual.
+
+    What is held is where it is seen, so that the sheet moves where the view of it does.
+    """
+    x, s = likelihood.frame.x, likelihood.frame.s
 
     def along(u):
         to = theta + directions @ u
@@ -180,8 +192,9 @@ def _parameter_columns(
         return unbalanced, look(changed, x), tool_residual(sheet, changed, to, frame, context, x)
 
     dforce, dview, dtool = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))
-    seen = each(partial(balance.apply, linear.dr_dx), seen_shift(frame, dview))
-    return dforce - seen, dtool / tool_sd(frame)
+    seen = seen_shift(frame, dview)
+    view = jnp.where(frame.counted[:, None, None], seen, 0.0)
+    return dforce - each(likelihood.forces, seen - view), view, dtool / tool_sd(frame)
 
 
 @eqx.filter_jit

@@ -7,15 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jiggle_mj.estimator.attribution.every_frame import weighted_together
+from jiggle_mj.estimator.attribution.every_frame import misfit_under, weighted_together
 from jiggle_mj.estimator.attribution.frame_likelihood import with_noise
-from jiggle_mj.estimator.attribution.gauss_newton import Weighed, evaluated
+from jiggle_mj.estimator.attribution.gauss_newton import Weighed, evaluated, linearise_at, start
 from jiggle_mj.estimator.attribution.likeliest_noise import likeliest_noise
+from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.blas import one_thread
+from jiggle_mj.estimator.effects import LIBRARY
 
 SIZE = 2.5
 """Variance of all errors over the assumed one."""
 FRAMES = 4
+STEP = 1e-6
+"""Change of a parameter in the differences."""
+OF_HELD = 0.05
+"""Share that what is held has of the slope."""
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +96,22 @@ def test_the_likeliest_autocorrelation_is_that_of_what_was_drawn(grasp, persiste
         at = alike(grasp, 0.5, errors)
         found = likeliest_noise(at.problem, at.weights, at.residuals)
     assert found.persistence == pytest.approx(persistence, abs=0.1)
+
+
+@pytest.mark.parametrize("persistence", [0.0, 0.95])
+def test_the_slope_by_what_moves_the_view_is_that_of_the_normal_equations(light, persistence):
+    """Against differences of the weighted residuals of the same states, of which what is held would move alone."""
+    fitted, name = light[0].declared.fitted, "camera_bias"
+    problem = Problem.build(light[2], tuple(effect for effect in LIBRARY if effect.name == name))
+    problem = problem.with_scales(replace(problem.scales, persistence=persistence))
+    at, unit, frames = problem.sheet.place(name), np.eye(problem.sheet.size), list(fitted.weights)
+    with jax.enable_x64(True), one_thread():
+        point = start(problem, 1e-5 * unit[at[0]], fitted.point.s, fitted.point.states, frames)
+        here = linearise_at(problem, at, point, frames)
+        differences = []
+        for k in at[:3]:
+            ends = [replace(point, theta=point.theta + sign * STEP * unit[k]) for sign in (1, -1)]
+            plus, minus = (misfit_under(problem, here.weights, one) for one in ends)
+            differences.append((plus - minus) / (4 * STEP))
+    found, true = here.square[len(point.s) :, -1][:3], np.array(differences)
+    assert np.linalg.norm(found - true) < OF_HELD * np.linalg.norm(true)
