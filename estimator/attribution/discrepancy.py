@@ -93,9 +93,16 @@ def refused(closed: Closed) -> list[dict[str, str]]:
             if name not in named:
                 lead, others = best.log_evidence - one.log_evidence, [other for other in one.names if other != name]
                 beside = f" beside {' and '.join(others)}" if others else ""
-                why = f"its probability{beside} is {probability:.2g}; {best.title} leads by {lead:.0f} nat"
+                why = f"its probability{beside} is {probability:.2g}; {best.title} {_led(lead)}"
                 reasons.setdefault(name, why)
     return [{"name": name, "why": why} for name, why in reasons.items()]
+
+
+def _led(lead: float) -> str:
+    """Return by how much the likeliest hypothesis leads; with fewer effects it may be likelier by its prior alone."""
+    if lead >= 0:
+        return f"leads by {lead:.0f} nat"
+    return f"is likelier before any frame is seen, by more than the {-lead:.0f} nat of these"
 
 
 def _probability(one: Hypothesis, probability: float) -> dict[str, Any]:
