@@ -4,10 +4,10 @@ With the terms of `frame_likelihood`, at the bounded stiffnesses s and the param
 
     H e + r + D ds + G dtheta
 
-are the forces, where r = 0 but for rounding. What counts are their innovations. In these H is that of the frame itself
-for what moves the view of both; what moves the state of the frame before counts as if its H were the same. The
-amplitudes a are eliminated frame by frame, c grasp by grasp. At a noisy state instead of the predicted one this would
-be an errors-in-variables problem, with false effects.
+are the forces, where r is what the prediction leaves off balance. What counts are their innovations. In these H is that
+of the frame itself for what moves the view of both; what moves the state of the frame before counts as if its H were
+the same, and its r is left out. The amplitudes a are eliminated frame by frame, c grasp by grasp. At a noisy state
+instead of the predicted one this would be an errors-in-variables problem, with false effects.
 """
 
 import equinox as eqx

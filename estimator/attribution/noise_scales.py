@@ -1,9 +1,10 @@
 """Sizes of the errors that no effect stands for, which are free in every hypothesis, and their prior.
 
-Force errors of the model, smooth force fields, the tool's reports, the noise that neighbours share and the tool's
-measured force each have a variance, over the assumed one. Its logarithm is normal where only what is assumed is wrong,
-or, with the same probability, larger by any amount: then the model lacks something that has no name here. The
-autocorrelation of the errors from frame to frame may be anything from 0 to 1, all with the same density.
+Force errors of the model, smooth force fields, the tool's reports, the noise that neighbours share, the tool's measured
+force and, where the noise is assumed, all errors together each have a variance, over the assumed one. Its logarithm is
+normal where only what is assumed is wrong, or, with the same probability, larger by any amount: then the model lacks
+something that has no name here. The autocorrelation of the errors from frame to frame may be anything from 0 to 1, all
+with the same density.
 """
 
 from collections.abc import Callable
