@@ -40,9 +40,7 @@ def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, Fram
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameLikelihood:
-        before = problem.before(k, frames)
-        persistence, new = problem.autocorrelation(k, before), problem.new(k, before)
-        return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise, persistence, new)
+        return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise, *problem.persistence(k, frames))
 
     return each_frame(problem, point, frames, one)
 

@@ -101,7 +101,7 @@ def frame_errors(
     m, size = smooth.shape[2], len(known.mean)
     c = jnp.concatenate([known.mean[:, None], known.root, jnp.zeros((size, m))], axis=1)
     forces = (likelihood.fields @ c).at[:, :, 0].add(i)
-    a = -jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nim,nik->mk", likelihood.noise, forces))
+    a = -likelihood.smooth_amplitudes(forces)
     a = a.at[:, 1 + size :].add(jax.scipy.linalg.solve_triangular(likelihood.spread.T, jnp.eye(m)))
     forces = forces + each(partial(balance.apply, frame.dr_dx), smooth @ a)
     explained = each(partial(balance.explained, frame), forces)

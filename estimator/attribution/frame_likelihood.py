@@ -80,9 +80,18 @@ class FrameLikelihood(eqx.Module):
         self, left: Float[Array, "n 3 l"], right: Float[Array, "n 3 r"], white: Float[Array, "n 3 r"]
     ) -> Float[Array, "l r"]:
         """Return left^T (N + H F F^T H^T)^-1 right, given `white` = N^-1 right."""
-        a, b = (jnp.einsum("nic,nik->ck", self.noise, side) for side in (left, right))
-        solved = jax.scipy.linalg.cho_solve((self.spread, True), b)
-        return jnp.einsum("nil,nir->lr", left, white) - a.T @ solved
+        a = jnp.einsum("nic,nik->ck", self.noise, left)
+        return jnp.einsum("nil,nir->lr", left, white) - a.T @ self.smooth_amplitudes(right)
+
+    def smooth_amplitudes(self, columns: Float[Array, "n 3 k"]) -> Float[Array, "c k"]:
+        """Return (H F)^T (N + H F F^T H^T)^-1 columns: minus the likeliest a for each."""
+        return jax.scipy.linalg.cho_solve((self.spread, True), jnp.einsum("nic,nik->ck", self.noise, columns))
+
+    def solved(self, forces: Float[Array, "n 3"]) -> tuple[Float[Array, "n 3"], Float[Array, " c"]]:
+        """Return (N + H F F^T H^T)^-1 forces, and their `smooth_amplitudes`."""
+        column = forces[:, :, None]
+        a = self.smooth_amplitudes(column)[:, 0]
+        return self.whitened(column)[:, :, 0] - self.noise @ a, a
 
     def innovation(self, now: Float[Array, "*n"], before: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return the innovation of errors, or of how they change, from those of this frame and of the one before."""

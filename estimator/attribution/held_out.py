@@ -212,8 +212,7 @@ def _variances(
     by_force, by_fit = responses(fitted, predicted, likelihood, k)
     error = np.asarray(problem.sheet.balance.error(jnp.asarray(predicted.states[k])))
     fields = np.einsum("ani,nij->aj", by_force, np.asarray(likelihood.fields)) * problem.amplitude
-    wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2))
-    wrong = wrong + np.sum(fields**2, axis=1)
+    wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2)) + np.sum(fields**2, axis=1)
     unsure = np.sum((by_fit @ known) * by_fit, axis=1)
     return Variances(
         fit=np.maximum(unsure, 0).reshape(n, 3),

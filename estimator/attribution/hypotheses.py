@@ -207,10 +207,8 @@ def of_all_frames(found: list[Hypothesis], frames: list[int], log: Log) -> list[
         return fitted[one]
 
     def estimated(one: Hypothesis) -> Hypothesis:
-        found = max(
-            of_all.log_evidence + more * (one.log_evidence - few.log_evidence) for few, of_all in fitted.items()
-        )
-        return fitted.get(one) or replace(one, log_evidence=found)
+        beyond = [whole.log_evidence + more * (one.log_evidence - few.log_evidence) for few, whole in fitted.items()]
+        return fitted.get(one) or replace(one, log_evidence=max(beyond))
 
     of_all(declared)
     while True:

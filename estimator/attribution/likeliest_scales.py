@@ -117,9 +117,7 @@ def _with_likeliest_noise(
     problem = problem.with_scales(scales)
 
     def one(k: int) -> FrameLikelihood:
-        before = problem.before(k, weights)
-        kept, new = problem.autocorrelation(k, before), problem.new(k, before)
-        return with_noise(weights[k], factor, jnp.asarray(kept), jnp.asarray(new))
+        return with_noise(weights[k], factor, *map(jnp.asarray, problem.persistence(k, weights)))
 
     changed = parallel_map(one, weights)
     return problem, changed, weighted_together(problem, changed, {k: found.own for k, found in residuals.items()})

@@ -93,11 +93,9 @@ def _of_before(
     likelihood: FrameLikelihood, i: Float[Array, "n 3"], amplitudes: CommonAmplitudes
 ) -> Float[Array, "n 3"]:
     """Return the slope of a frame's -ln likelihood by the residual e of the frame before it [nat/m]."""
-    z = i + likelihood.fields @ amplitudes.mean
-    white = likelihood.whitened(z[:, :, None])[:, :, 0]
-    a = jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nic,ni->c", likelihood.noise, z))
-    pulled = likelihood.balance.transposed(likelihood.frame.dr_dx, white - likelihood.noise @ a)
-    return likelihood.innovation(jnp.zeros_like(z), pulled)
+    weighted, _ = likelihood.solved(i + likelihood.fields @ amplitudes.mean)
+    pulled = likelihood.balance.transposed(likelihood.frame.dr_dx, weighted)
+    return likelihood.innovation(jnp.zeros_like(pulled), pulled)
 
 
 def whole_slope(fitted: Fitted, of_frames: dict[int, FrameSlope]) -> Float[np.ndarray, " k"]:

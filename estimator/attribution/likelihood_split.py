@@ -4,7 +4,7 @@ With the smooth force fields c and the tool's offset o of each grasp at their li
 frame's forces and C its covariance with m coordinates observed (see `frame_likelihood`), t the tool's residual and v
 the variance of its scale, frame k has
 
-    -1/2 [z^T C^-1 z + ln |C| - 2 ln |H| + m ln (1 - rho^2) + |t - o|^2 / v + 3 ln v],   z = i + Q c,
+    -1/2 [z^T C^-1 z + ln |C| - 2 ln |H| + m ln (kappa (1 - rho^2)) + |t - o|^2 / v + 3 ln v],   z = i + Q c,
 
 and each grasp, for what its frames share,
 
@@ -24,7 +24,6 @@ which is never negative, and of the determinants an even share if it is observed
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -98,10 +97,7 @@ def _squares(
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Return the terms of z^T C^-1 z: of each particle, and |a|^2."""
     balance, frame = likelihood.balance, likelihood.frame
-    z = i + likelihood.fields @ c
-    white = likelihood.whitened(z[:, :, None])[:, :, 0]
-    a = jax.scipy.linalg.cho_solve((likelihood.spread, True), jnp.einsum("nic,ni->c", likelihood.noise, z))
-    weighted = white - likelihood.noise @ a  # w f, and R^-1 d = H^T w f
+    weighted, a = likelihood.solved(i + likelihood.fields @ c)  # w f, and R^-1 d = H^T w f
     weight, pull = frame.weight, balance.transposed(frame.dr_dx, weighted)
     precision = balance.position_precision(frame.evidence)
     known = weight > 0

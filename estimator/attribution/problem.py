@@ -97,6 +97,11 @@ class Problem:
         index = 0 if before is None else self.history.frames[before].index
         return max(self.history.frames[k].index - index, 1)
 
+    def persistence(self, k: int, frames: Iterable[int]) -> tuple[float, float]:
+        """Return the `autocorrelation` of frame k and the last of some frames before it, and what is `new` since."""
+        before = self.before(k, frames)
+        return self.autocorrelation(k, before), self.new(k, before)
+
     def new(self, k: int, before: int | None) -> float:
         """Return the variance of what is new of the errors of frame k since another one, over the assumed one."""
         return (self.scales.noise or 1.0) * (1 - self.autocorrelation(k, before) ** 2)

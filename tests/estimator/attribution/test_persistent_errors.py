@@ -39,9 +39,7 @@ def alike(grasp, persistence: float, residuals: dict[int, np.ndarray]) -> Weighe
     problem, first = problem.with_scales(replace(problem.scales, persistence=persistence)), fitted.weights[frames[0]]
     weights, own = {}, {}
     for k in frames:
-        before = problem.before(k, frames)
-        share, new = problem.autocorrelation(k, before), problem.new(k, before)
-        weights[k] = with_noise(first, jnp.asarray(1.0), jnp.asarray(share), jnp.asarray(new))
+        weights[k] = with_noise(first, jnp.asarray(1.0), *map(jnp.asarray, problem.persistence(k, frames)))
         positions = jnp.asarray(first.seen[:, None] * residuals[k])
         own[k] = replace(fitted.residuals[k].own, positions=positions, unbalanced=jnp.zeros_like(positions))
     return evaluated(problem, fitted.point, weights, weighted_together(problem, weights, own))
