@@ -13,6 +13,7 @@ from .explain import explanation
 from .force_report import force_report
 from .hypotheses import Hypothesis
 from .localisation import localisation
+from .persistence import new_share
 from .problem import Problem
 from .reported_part import reported_part
 from .suggestion import Suggestion
@@ -126,12 +127,13 @@ def _probability(one: Hypothesis, probability: float) -> dict[str, Any]:
 
 def _persistence(problem: Problem, noise: StillNoise) -> dict[str, float]:
     """Return the autocorrelation of the errors, and the sd of what points err by in a frame's step and in all [m]."""
-    last, size = len(problem.history.frames) - 1, np.hypot(noise.sd, noise.smooth_sd * problem.scales.smooth**0.5)
-    step, whole = problem.new(last, last - 1 if last else None), problem.new(last, None)
+    scales = problem.scales
+    size = np.hypot(noise.sd, noise.smooth_sd * scales.smooth**0.5) * (scales.noise or 1.0) ** 0.5
+    step, whole = new_share(scales.autocorrelation, np.array([1, max(problem.history.frames[-1].index, 1)])) ** 0.5
     return {
-        "autocorrelation": problem.scales.persistence,
-        "step_m": float(size * step**0.5),
-        "whole_m": float(size * whole**0.5),
+        "autocorrelation": scales.autocorrelation,
+        "step_sd_m": float(size * step),
+        "whole_sd_m": float(size * whole),
     }
 
 

@@ -1,15 +1,15 @@
 """All frames of a recording at a point: their weights, normal equations, residuals and likelihood."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..effects.sheet_model import FrameContext
 from ..parallel_map import T, parallel_map
-from .frame_likelihood import FrameLikelihood, frame_likelihood
+from .frame_likelihood import FrameLikelihood, frame_likelihood, with_noise
 from .grasped_frames import ClosedFrame
 from .linear import (
     Columns,
@@ -22,6 +22,7 @@ from .linear import (
     weighted_residuals,
 )
 from .normal_equations import Common, common, pull_sum, tool_sum
+from .persistence import carried
 from .problem import Point, Problem
 
 N_DIRECTIONS = 16
@@ -35,14 +36,29 @@ def directions(problem: Problem, free: np.ndarray) -> Float[np.ndarray, "p d"]:
     return along
 
 
-def weighed(problem: Problem, point: Point, frames: list[int]) -> dict[int, FrameLikelihood]:
-    """Return the weights of residuals of each frame at a point."""
+def weighed(
+    problem: Problem, point: Point, frames: list[int], *, among: Iterable[int] | None = None
+) -> dict[int, FrameLikelihood]:
+    """Return the weights of residuals of each frame at a point, with errors that follow those of other frames.
+
+    Args:
+        problem: has the frames.
+        point: parameters and states.
+        frames: frames to weigh.
+        among: the frames whose errors theirs may follow; the frames themselves if None.
+    """
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameLikelihood:
-        return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise, *problem.persistence(k, frames))
+        persistence = problem.persistence(k, frames if among is None else among)
+        return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise, persistence)
 
     return each_frame(problem, point, frames, one)
+
+
+def following(problem: Problem, likelihood: FrameLikelihood, k: int, frames: Iterable[int]) -> FrameLikelihood:
+    """Return the weights of a frame's residuals with errors that follow those of some other frames before it."""
+    return with_noise(likelihood, jnp.ones(()), problem.persistence(k, frames))
 
 
 def linearised(
@@ -59,10 +75,11 @@ def linearised(
         return columns_of(problem.sheet, weights[k], theta, along_, frame, context)
 
     columns = each_frame(problem, point, weights, one)
+    moved = {k: found.sheet for k, found in columns.items()}
 
     def equations(k: int) -> NormalEquations:
-        before = problem.before(k, weights)
-        return normal_equations(weights[k], columns[k], None if before is None else columns[before], residuals[k])
+        before = carried(problem.last_seen(k, weights), moved, jax.tree.map(jnp.zeros_like, moved[k]))
+        return normal_equations(weights[k], columns[k], before, residuals[k])
 
     return parallel_map(equations, weights)
 
@@ -96,17 +113,11 @@ def weighted_together(
     problem: Problem, weights: dict[int, FrameLikelihood], every: dict[int, Residuals]
 ) -> dict[int, WeightedResiduals]:
     """Return the weighted residuals of frames from the residuals of each."""
-    own = dict[int, Residuals]()
-    for frames in problem.by_grasp(sorted(every)).values():
-        last = jnp.zeros_like(every[frames[0]].positions)
-        for k in frames:
-            last = jnp.where(weights[k].seen[:, None] > 0, every[k].positions, last)
-            own[k] = replace(every[k], positions=last)
+    sheets = {k: found.sheet for k, found in every.items()}
 
     def one(k: int) -> WeightedResiduals:
-        before = problem.before(k, weights)
-        nothing = jnp.zeros_like(own[k].positions)
-        return weighted_residuals(weights[k], own[k], nothing if before is None else own[before].positions)
+        before = carried(problem.last_seen(k, weights), sheets, jax.tree.map(jnp.zeros_like, sheets[k]))
+        return weighted_residuals(weights[k], every[k], before)
 
     return parallel_map(one, weights)
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .every_frame import following, weighted_together
 from .gauss_newton import (
     Fitted,
     better_point,
@@ -102,11 +103,20 @@ def without(fitted: Fitted, part: int) -> Fitted:
     """Return one more step from a fit without the frames of one part, from the normal equations that it has.
 
     The likeliest set of attachments is no candidate: of many equally likely sets, fewer frames would take another one
-    at random. The first frame after the part counts as before, by what it adds to the last one of the part.
+    at random.
     """
-    kept = [k for k in fitted.equations if fitted.problem.history.frames[k].part != part]
-    weights, residuals = {k: fitted.weights[k] for k in kept}, {k: fitted.residuals[k] for k in kept}
-    at = evaluated(fitted.problem, fitted.point, weights, residuals)
-    now = fit_at(at, fitted.named, {k: fitted.equations[k] for k in kept})
+    now = kept_frames(fitted, part)
     better = better_point(now, candidate_steps(now, likeliest_set=False))
     return now if better is None else replace(now, point=better.point, log_likelihood=better.log_likelihood)
+
+
+def kept_frames(fitted: Fitted, part: int) -> Fitted:
+    """Return a fit's point without the frames of one part, as if they had never been."""
+    problem, every = fitted.problem, fitted.weights
+    kept = [k for k in every if problem.history.frames[k].part != part]
+    follow = [k for k in kept if (problem.last_seen(k, kept) != problem.last_seen(k, every)).any()]
+    weights = {k: every[k] if k not in follow else following(problem, every[k], k, kept) for k in kept}
+    residuals = weighted_together(problem, weights, {k: fitted.residuals[k].own for k in kept})
+    at = evaluated(problem, fitted.point, weights, residuals)
+    kept_equations = {k: fitted.equations[k] for k in kept}
+    return linearised_fit(at, fitted.named) if follow else fit_at(at, fitted.named, kept_equations)

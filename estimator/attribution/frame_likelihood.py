@@ -37,6 +37,7 @@ from ..filters.smooth_noise import each
 from ..physics.block_tridiagonal import BlockCholesky, log_det, normal_cholesky
 from ..physics.membrane import TriangleMembrane
 from .grasped_frames import ClosedFrame
+from .persistence import Persistence
 from .sheet import PredictedSheet, mean_of_held
 from .tool_pull import adjoint, pull_slope
 
@@ -62,17 +63,15 @@ class FrameLikelihood(eqx.Module):
     spread: Float[Array, "c c"]
     """Lower Cholesky factor of I + F^T H^T N^-1 H F."""
     fields: Float[Array, "n 3 q"]
-    """Smooth force fields Q."""
+    """Smooth force fields Q, times the factor of what drives the errors of all frames alike."""
     white: Float[Array, "n 3 q"]
     """Smooth force fields, whitened: N^-1 Q."""
     among: Float[Array, "q q"]
     """Inner products of Q under (N + H F F^T H^T)^-1."""
     log_square: Float[Array, ""]
     """ln |H^T H| over the particles with a force equation."""
-    persistence: Float[Array, ""]
-    """Autocorrelation rho of its errors and of those of the frame before."""
-    new: Float[Array, ""]
-    """Variance kappa (1 - rho^2) of what is new of its errors, over the assumed one of all."""
+    persistence: Persistence
+    """How its errors follow those of the frames before."""
     adjoint: Float[Array, "n 3 3"] | None = None
     """By how much the tool's force falls with a force on each particle [1]; None where no frame has a measured one."""
 
@@ -92,10 +91,6 @@ class FrameLikelihood(eqx.Module):
         column = forces[:, :, None]
         a = self.smooth_amplitudes(column)[:, 0]
         return self.whitened(column)[:, :, 0] - self.noise @ a, a
-
-    def innovation(self, now: Float[Array, "*n"], before: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the innovation of errors, or of how they change, from those of this frame and of the one before."""
-        return (now - self.persistence * before) / jnp.sqrt(self.new)
 
     def whitened(self, columns: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
         """Return N^-1 times each column."""
@@ -121,7 +116,7 @@ class FrameLikelihood(eqx.Module):
         w, known = self.frame.weight, self.frame.weight > 0
         log_weights = jnp.sum(jnp.where(known, 3 * jnp.log(jnp.where(known, w, 1.0)), 0.0))
         smooth = 2 * jnp.sum(jnp.log(jnp.diagonal(self.spread)))
-        new = 3 * jnp.sum(self.seen) * jnp.log(self.new)
+        new = 3 * jnp.sum(self.seen * jnp.log(self.persistence.new))
         return log_det(self.frame.factor) - log_weights + smooth - self.log_square + new
 
     def inner(self, rows: Float[Array, "n p 3 3"]) -> Float[Array, "n p 3 3"]:
@@ -145,18 +140,16 @@ def frame_likelihood(
     context: FrameContext,
     x: Float[Array, "n 3"],
     noise: Float[Array, "n modes"],
-    persistence: float = 0.0,
-    new: float = 1.0,
+    persistence: Persistence,
 ) -> FrameLikelihood:
     """Return a frame's likelihood at its predicted state x; `noise` are the smooth noise's fields [m].
 
-    `persistence` is the autocorrelation of its errors and of those of the frame before, and `new` the variance of what
-    is new of them. It is two programs, like `normal_equations`: as one, XLA lays the factor out so that a solve takes
-    1.5 times as long.
+    It is two programs, like `normal_equations`: as one, XLA lays the factor out so that a solve takes 1.5 times as
+    long.
     """
-    likelihood = _likelihood(*around(sheet, theta, s, frame, context, x), frame, noise)
+    balance, linear, fields = around(sheet, theta, s, frame, context, x)
+    likelihood = _likelihood(balance, linear, persistence.drive * fields, frame, noise, persistence)
     likelihood = replace(likelihood, log_square=_log_square(likelihood))
-    likelihood = replace(likelihood, persistence=jnp.asarray(persistence), new=jnp.asarray(new))
     if frame.pull is None:
         return likelihood
     return replace(likelihood, adjoint=_pull_adjoint(sheet, likelihood, theta, frame, context))
@@ -166,24 +159,22 @@ def with_force_sd(
     likelihood: FrameLikelihood, force_sd: Float[Array, ""], frame: ClosedFrame, noise: Float[Array, "n modes"]
 ) -> FrameLikelihood:
     """Return a frame's likelihood with another standard deviation of force errors, the field of `ForceBalance` [N]."""
-    found = _likelihood(*_with_force_sd(likelihood, force_sd), frame, noise)
-    kept = {name: getattr(likelihood, name) for name in ("log_square", "persistence", "new", "adjoint")}
-    return replace(found, **kept)
+    found = _likelihood(*_with_force_sd(likelihood, force_sd), frame, noise, likelihood.persistence)
+    return replace(found, log_square=likelihood.log_square, adjoint=likelihood.adjoint)
 
 
 @eqx.filter_jit
-def with_noise(
-    likelihood: FrameLikelihood, factor: Float[Array, ""], persistence: Float[Array, ""], new: Float[Array, ""]
-) -> FrameLikelihood:
-    """Return a frame's likelihood with another autocorrelation and share of new errors, and a larger smooth noise."""
-    eye = jnp.eye(len(likelihood.spread))
+def with_noise(likelihood: FrameLikelihood, factor: Float[Array, ""], persistence: Persistence) -> FrameLikelihood:
+    """Return a frame's likelihood with errors that follow others as given, and with so many times the smooth noise."""
+    eye, driven = jnp.eye(len(likelihood.spread)), persistence.drive / likelihood.persistence.drive
     spread = eye + factor**2 * (likelihood.spread @ likelihood.spread.T - eye)
     changed = replace(
         likelihood,
         noise=factor * likelihood.noise,
         spread=jnp.linalg.cholesky(spread),
+        fields=driven * likelihood.fields,
+        white=driven * likelihood.white,
         persistence=persistence,
-        new=new,
     )
     return replace(changed, among=changed.dot(changed.fields, changed.fields, changed.white))
 
@@ -227,6 +218,7 @@ def _likelihood(
     fields: Float[Array, "n 3 q"],
     frame: ClosedFrame,
     noise: Float[Array, "n modes"],
+    persistence: Persistence,
 ) -> FrameLikelihood:
     smooth = each(partial(balance.apply, linear.dr_dx), seen_noise(frame, noise))
     white = each(partial(balance.whitened, linear), smooth)
@@ -240,8 +232,7 @@ def _likelihood(
         white=each(partial(balance.whitened, linear), fields),
         among=jnp.zeros((N_FIELDS, N_FIELDS)),
         log_square=jnp.zeros(()),
-        persistence=jnp.zeros(()),
-        new=jnp.ones(()),
+        persistence=persistence,
     )
     return replace(likelihood, among=likelihood.dot(fields, fields, likelihood.white))
 

@@ -1,8 +1,10 @@
 """A recording's frames with closed jaws, as arrays for fits over all of them at once."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..effects.frame_history import FrameRecord
@@ -61,3 +63,8 @@ class Timed(FrameRecord):
     """Index in the recording."""
     part: int
     """Number of the part that is held out as a whole: the grasp, or a third of the only one."""
+
+    @cached_property
+    def counted(self) -> Bool[np.ndarray, " n"]:
+        """Return which particles are observed and not held."""
+        return np.asarray(self.frame.counted)

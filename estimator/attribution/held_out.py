@@ -5,7 +5,7 @@ Where other frames of the same grasp were fitted before, their errors persist.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +19,7 @@ from .frame_likelihood import FrameLikelihood
 from .gauss_newton import Fitted
 from .grasped_frames import ClosedFrame
 from .linear import columns_of
+from .persistence import carried
 from .problem import Point, Problem
 from .sheet import predict_all
 
@@ -107,40 +108,33 @@ def predict_held_out(fitted: Fitted, part: int, *, persistent: bool = True) -> H
     """
     problem = fitted.problem
     frames, closed = problem.frames({part}), problem.history.frames
-    before = {k: problem.before(k, fitted.weights) for k in frames}
-    lasts = sorted({last for last in before.values() if last is not None})
+    last = {k: problem.last_seen(k, fitted.weights) for k in frames}
+    lasts = sorted({int(j) for one in last.values() for j in one[one >= 0]})
     predicted = from_rest(problem, fitted.point, [*lasts, *frames], by_tool=True)
+    error = {k: np.asarray(closed[k].frame.y) - predicted.seen[k] for k in [*lasts, *frames]}
 
-    @cache
-    def weights() -> dict[int, FrameLikelihood]:
-        return weighed(problem, predicted, frames)
-
-    def lasting(k: int) -> Float[np.ndarray, "m 3"]:
-        last, counted = before[k], np.asarray(closed[k].frame.counted)
-        if last is None:
-            return np.zeros((int(counted.sum()), 3))
-        frame = closed[last].frame
-        error = np.where(np.asarray(frame.counted)[:, None], np.asarray(frame.y) - predicted.seen[last], 0.0)
-        return problem.autocorrelation(k, last) * error[counted]
+    def residual(k: int) -> Float[np.ndarray, "m 3"]:
+        found = error[k]
+        if persistent:
+            rho = np.asarray(problem.persistence(k, fitted.weights).autocorrelation)
+            found = found - rho[:, None] * carried(last[k], error, np.zeros_like(found))
+        return found[closed[k].counted]
 
     def variances() -> Variances:
         known = _covariance(fitted)
+        weights = weighed(problem, predicted, [*lasts, *frames], among=fitted.weights)
+        by_fit = {j: _of_particles(responses(fitted, predicted, weights[j], j)[1]) for j in lasts}
 
         def one(k: int) -> Variances:
-            found = _variances(fitted, predicted, weights()[k], k, known)
-            return replace(found, others=problem.new(k, before[k]) * found.others)
+            return _variances(fitted, predicted, weights[k], k, by_fit, known)
 
         every = parallel_map(one, frames)
-        counted = {k: np.asarray(closed[k].frame.counted) for k in frames}
         return Variances(
-            fit=np.concatenate([every[k].fit[counted[k]] for k in frames]),
-            others=np.concatenate([every[k].others[counted[k]] for k in frames]),
+            fit=np.concatenate([every[k].fit[closed[k].counted] for k in frames]),
+            others=np.concatenate([every[k].others[closed[k].counted] for k in frames]),
         )
 
-    residual = residuals(problem, predicted, frames)
-    if persistent:
-        residual = residual - np.concatenate([lasting(k) for k in frames])
-    return HeldOut(residual=residual, compute_variances=variances)
+    return HeldOut(residual=np.concatenate([residual(k) for k in frames]), compute_variances=variances)
 
 
 def noise_variance(problem: Problem, frame: ClosedFrame) -> Float[np.ndarray, " n"]:
@@ -196,6 +190,7 @@ def _variances(
     predicted: Point,
     likelihood: FrameLikelihood,
     k: int,
+    by_fit_before: dict[int, Float[np.ndarray, "n 3 k"]],
     known: Float[np.ndarray, "k k"],
 ) -> Variances:
     """Return the variances of each observed coordinate of frame k.
@@ -205,19 +200,24 @@ def _variances(
         predicted: the prediction.
         likelihood: weights at the predicted state.
         k: the frame.
+        by_fit_before: how the residuals of the last fitted frames move with s and theta.
         known: covariance of s and parameters.
     """
     problem, n = fitted.problem, len(likelihood.seen)
-    closed = problem.history.frames[k].frame
+    closed, last = problem.history.frames[k].frame, problem.last_seen(k, fitted.weights)
     by_force, by_fit = responses(fitted, predicted, likelihood, k)
+    by_fit = _of_particles(by_fit)
+    rho, new = (np.asarray(one) for one in (likelihood.persistence.autocorrelation, likelihood.persistence.new))
+    by_fit = by_fit - rho[:, None, None] * np.asarray(carried(last, by_fit_before, np.zeros_like(by_fit)))
     error = np.asarray(problem.sheet.balance.error(jnp.asarray(predicted.states[k])))
     fields = np.einsum("ani,nij->aj", by_force, np.asarray(likelihood.fields)) * problem.amplitude
     wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2)) + np.sum(fields**2, axis=1)
-    unsure = np.sum((by_fit @ known) * by_fit, axis=1)
-    return Variances(
-        fit=np.maximum(unsure, 0).reshape(n, 3),
-        others=wrong.reshape(n, 3) + (white_variance(closed) + np.sum(problem.noise**2, axis=1))[:, None],
-    )
+    others = wrong.reshape(n, 3) + (white_variance(closed) + np.sum(problem.noise**2, axis=1))[:, None]
+    return Variances(fit=np.maximum(np.sum((by_fit @ known) * by_fit, axis=2), 0), others=new[:, None] * others)
+
+
+def _of_particles(by_fit: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "n 3 k"]:
+    return by_fit.reshape(-1, 3, by_fit.shape[1])
 
 
 def responses(
@@ -239,7 +239,7 @@ def responses(
         closed,
         problem.history.context(k, states),
     )
-    of_parameters = columns.of_theta(likelihood)[:, :, : len(fitted.free)]
+    of_parameters = columns.sheet.of_theta(likelihood)[:, :, : len(fitted.free)]
     by_s = np.einsum("ani,ni->an", by_force, np.asarray(likelihood.frame.dr_ds))
     by_theta = np.einsum("ani,nij->aj", by_force, np.asarray(of_parameters))
     return by_force, np.concatenate([by_s, by_theta], axis=1)

@@ -21,7 +21,7 @@ from .frame_likelihood import N_FIELDS, FrameLikelihood, with_force_sd, with_noi
 from .gauss_newton import Weighed, evaluated
 from .likeliest_noise import likeliest_noise
 from .linear import WeightedResiduals
-from .noise_scales import LOG_RANGE, largest_variance, likeliest_variance, log_prior
+from .noise_scales import LOG_RANGE, likeliest_under, likeliest_variance, log_prior
 from .normal_equations import pull_sum, tool_sum
 from .problem import AMPLITUDE, Point, Problem
 
@@ -115,12 +115,8 @@ def _with_likeliest_noise(
     scales = likeliest_noise(problem, weights, residuals)
     factor = jnp.asarray((scales.smooth / problem.scales.smooth) ** 0.5)
     problem = problem.with_scales(scales)
-
-    def one(k: int) -> FrameLikelihood:
-        return with_noise(weights[k], factor, *map(jnp.asarray, problem.persistence(k, weights)))
-
-    changed = parallel_map(one, weights)
-    return problem, changed, weighted_together(problem, changed, {k: found.own for k, found in residuals.items()})
+    changed = parallel_map(lambda k: with_noise(weights[k], factor, problem.persistence(k, weights)), weights)
+    return problem, changed, weighted_together(problem, changed, {k: one.own for k, one in residuals.items()})
 
 
 def _likeliest_fields(
@@ -138,4 +134,4 @@ def _likeliest_fields(
         each = 1 + square * np.array(eigenvalues)
         return 0.5 * float(np.sum(square * np.array(along) / each - np.log(each)))
 
-    return largest_variance(log_likelihood)
+    return likeliest_under(log_likelihood)

@@ -67,8 +67,11 @@ def likelihood_slopes(at: Weighed) -> dict[int, FrameSlope]:
     def passed_on(k: int) -> Float[Array, "n 3"]:
         return _of_before(at.weights[k], residuals[k].innovation, amplitudes[k])
 
-    of_before = parallel_map(passed_on, at.weights)
-    of_next = {at.problem.before(k, at.weights): slope for k, slope in of_before.items()}
+    of_next = dict.fromkeys(at.weights, nothing)
+    for k, slope in parallel_map(passed_on, at.weights).items():
+        last = at.problem.last_seen(k, at.weights)
+        for j in np.unique(last[last >= 0]):
+            of_next[j] = of_next[j] + jnp.where(jnp.asarray(last == j)[:, None], slope, 0.0)
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameSlope:
         found = frame_slope(
@@ -81,7 +84,7 @@ def likelihood_slopes(at: Weighed) -> dict[int, FrameSlope]:
             residuals[k],
             noise,
             amplitudes[k],
-            of_next.get(k, nothing),
+            of_next[k],
         )
         return jax.block_until_ready(found)
 
@@ -92,10 +95,10 @@ def likelihood_slopes(at: Weighed) -> dict[int, FrameSlope]:
 def _of_before(
     likelihood: FrameLikelihood, i: Float[Array, "n 3"], amplitudes: CommonAmplitudes
 ) -> Float[Array, "n 3"]:
-    """Return the slope of a frame's -ln likelihood by the residual e of the frame before it [nat/m]."""
+    """Return the slope of a frame's -ln likelihood by the residuals e that its errors follow [nat/m]."""
     weighted, _ = likelihood.solved(i + likelihood.fields @ amplitudes.mean)
     pulled = likelihood.balance.transposed(likelihood.frame.dr_dx, weighted)
-    return likelihood.innovation(jnp.zeros_like(pulled), pulled)
+    return likelihood.persistence.innovation(jnp.zeros_like(pulled), pulled)
 
 
 def whole_slope(fitted: Fitted, of_frames: dict[int, FrameSlope]) -> Float[np.ndarray, " k"]:
@@ -122,20 +125,20 @@ def frame_slope(
 ) -> FrameSlope:
     """Return one frame's slope of -ln likelihood by s and theta at its predicted state x [nat].
 
-    `noise` are the smooth noise's fields [m], `of_next` is the slope of the next frame's -ln likelihood by e [nat/m].
+    `noise` are the smooth noise's fields [m], `of_next` is the slope by e of -ln likelihood of the frames whose errors
+    follow these [nat/m].
     """
-    s, known = likelihood.frame.s, likelihood.frame.weight > 0
+    s, known, persistence = likelihood.frame.s, likelihood.frame.weight > 0, likelihood.persistence
     errors = frame_errors(likelihood, seen_noise(frame, noise), residuals.innovation, amplitudes)
     of_square = inverse_band(likelihood.square_factor())
 
     def expected(theta: Float[Array, " p"], s: Float[Array, " n"], x: Float[Array, "n 3"]):
         balance, linear, Q = around(sheet, theta, s, frame, context, x)
         model = sheet.model(theta, context, frame.displacement)
-        seen = likelihood.seen[:, None] > 0
-        e = jnp.where(seen, frame.y - look(model, x), residuals.own.positions)
-        now, before = (balance.apply(linear.dr_dx, one) for one in (e, residuals.before))
-        f = each(partial(balance.apply, linear.dr_dx), errors.positions) + Q @ errors.amplitudes
-        f = f.at[:, :, 0].add(likelihood.innovation(now + linear.unbalanced, before))
+        e = likelihood.seen[:, None] * (frame.y - look(model, x))
+        new, unbalanced = map(persistence.innovation, (e, linear.unbalanced), residuals.before)
+        f = each(partial(balance.apply, linear.dr_dx), errors.positions) + persistence.drive * Q @ errors.amplitudes
+        f = f.at[:, :, 0].add(balance.apply(linear.dr_dx, new) + unbalanced)
         left = window_sums(balance.layout, errors.position_covariance, balance.places, linear.dr_dx)
         squared = left + jnp.sum(f**2, axis=(1, 2))
         weight = jnp.where(known, linear.weight, 1.0)

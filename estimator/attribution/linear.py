@@ -6,9 +6,11 @@ With the terms of `frame_likelihood`, at the bounded stiffnesses s and the param
 
 are the forces, where r is what the prediction leaves off balance. What counts are their innovations. In these H is that
 of the frame itself for what moves the view of both; what moves the state of the frame before counts as if its H were
-the same, and its r is left out. The amplitudes a are eliminated frame by frame, c grasp by grasp. At a noisy state
+the same. The amplitudes a are eliminated frame by frame, c grasp by grasp. At a noisy state
 instead of the predicted one this would be an errors-in-variables problem, with false effects.
 """
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -39,13 +41,20 @@ class NormalEquations(eqx.Module):
     """Rows of the residual of the tool's force, in units of its sd; None where no frame has a measured one."""
 
 
+class SheetResiduals(NamedTuple):
+    """The residuals of a sheet's particles."""
+
+    positions: Float[Array, "n 3"]
+    """Residuals e of the positions of particles that are seen, 0 of the others [m]."""
+    unbalanced: Float[Array, "n 3"]
+    """Forces r that do not balance [N]."""
+
+
 class Residuals(eqx.Module):
     """A frame's residuals at a predicted state."""
 
-    positions: Float[Array, "n 3"]
-    """Observed less predicted positions of particles that are seen, 0 of the others [m]."""
-    unbalanced: Float[Array, "n 3"]
-    """Forces r that do not balance [N]."""
+    sheet: SheetResiduals
+    """Those of the sheet."""
     tool: Float[Array, " 3"]
     """Residual of the tool, in units of `tool_sd`."""
     pull: Float[Array, " 3"] | None = None
@@ -56,9 +65,9 @@ class WeightedResiduals(eqx.Module):
     """A frame's residuals under given weights."""
 
     own: Residuals
-    """The residuals e; positions that are not seen are as the last frame of the grasp had them."""
-    before: Float[Array, "n 3"]
-    """Those positions in the frame before; 0 where there is none [m]."""
+    """The residuals."""
+    before: SheetResiduals
+    """Those of each particle in the frame that its error follows; 0 where there is none."""
     innovation: Float[Array, "n 3"]
     """Innovation of the forces H e + r [N]."""
     squared: Float[Array, ""]
@@ -77,8 +86,8 @@ def grasp_sd(frame: ClosedFrame) -> Float[Array, ""]:
     return jnp.hypot(GRASP_SD, frame.held_sd)
 
 
-class Columns(eqx.Module):
-    """By what a frame's residuals change at the state where its weights were computed."""
+class SheetColumns(NamedTuple):
+    """By what the residuals of a sheet's particles change."""
 
     of_s: Float[Array, "n 3"]
     """D, the change of the forces on each particle with its own s [N]."""
@@ -86,36 +95,46 @@ class Columns(eqx.Module):
     """Change of all forces with the parameters in some directions, where these move the sheet [N]."""
     of_view: Float[Array, "n 3 d"]
     """By how much they move what is seen of the sheet where it is [m]."""
-    tool: Float[Array, "3 d"]
-    """Change of the tool's residual, in units of `tool_sd`."""
-    pull: Float[Array, "3 k"] | None = None
-    """Rows of the residual of the tool's force, over s, theta, c (zero) and e, in units of its sd."""
 
     def of_theta(self, likelihood: FrameLikelihood) -> Float[Array, "n 3 d"]:
         """Return G, the change of all forces with the parameters [N]."""
         return self.of_state - each(likelihood.forces, self.of_view)
 
 
+class Columns(eqx.Module):
+    """By what a frame's residuals change at the state where its weights were computed."""
+
+    sheet: SheetColumns
+    """Change of the sheet's residuals."""
+    tool: Float[Array, "3 d"]
+    """Change of the tool's residual, in units of `tool_sd`."""
+    pull: Float[Array, "3 k"] | None = None
+    """Rows of the residual of the tool's force, over s, theta, c (zero) and e, in units of its sd."""
+
+
 def normal_equations(
-    likelihood: FrameLikelihood, columns: Columns, before: Columns | None, residuals: WeightedResiduals
+    likelihood: FrameLikelihood, columns: Columns, before: SheetColumns, residuals: WeightedResiduals
 ) -> NormalEquations:
-    """Return a frame's normal equations, from its columns and from those of the frame before it in the grasp."""
-    last: Columns = jax.tree.map(jnp.zeros_like, columns) if before is None else before
+    """Return a frame's normal equations.
+
+    Args:
+        likelihood: its weights.
+        columns: by what its residuals change.
+        before: the same of each particle in the frame that its error follows; 0 where there is none.
+        residuals: its weighted residuals.
+    """
     tool = jnp.concatenate([columns.tool, _no_common(likelihood), residuals.own.tool[:, None]], axis=1)
-    square = _inner_products(likelihood, *_innovations(likelihood, columns, last, residuals.innovation))
+    square = _inner_products(likelihood, *_innovations(likelihood, columns.sheet, before, residuals.innovation))
     return NormalEquations(square=square, tool=tool, pull=columns.pull)
 
 
 @eqx.filter_jit
 def _innovations(
-    likelihood: FrameLikelihood, columns: Columns, before: Columns, of_forces: Float[Array, "n 3"]
+    likelihood: FrameLikelihood, columns: SheetColumns, before: SheetColumns, of_forces: Float[Array, "n 3"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 j"]]:
     """Return the innovations of D, and of G and of the forces together."""
-    of_s, of_state, of_view = (
-        likelihood.innovation(getattr(columns, name), getattr(before, name)) for name in ("of_s", "of_state", "of_view")
-    )
-    of_theta = of_state - each(likelihood.forces, of_view)
-    return of_s, jnp.concatenate([of_theta, of_forces[:, :, None]], axis=2)
+    new = SheetColumns(*map(likelihood.persistence.innovation, columns, before))
+    return new.of_s, jnp.concatenate([new.of_theta(likelihood), of_forces[:, :, None]], axis=2)
 
 
 def columns_of(
@@ -131,7 +150,8 @@ def columns_of(
     pull = None
     if frame.pull is not None:
         pull = _pull_rows(sheet, likelihood, theta, directions, frame, context)
-    return Columns(of_s=likelihood.frame.dr_ds, of_state=of_state, of_view=of_view, tool=tool, pull=pull)
+    moved = SheetColumns(of_s=likelihood.frame.dr_ds, of_state=of_state, of_view=of_view)
+    return Columns(sheet=moved, tool=tool, pull=pull)
 
 
 @eqx.filter_jit
@@ -158,14 +178,15 @@ def residuals_of(
         off = jnp.where(frame.held[:, None], 0.0, unbalanced)
         predicted = predicted - jnp.einsum("nic,ni->c", likelihood.adjoint, off)
         pull = frame.pull.weight * (predicted - frame.pull.force)
-    return Residuals(positions=positions, unbalanced=unbalanced, tool=tool, pull=pull)
+    return Residuals(sheet=SheetResiduals(positions, unbalanced), tool=tool, pull=pull)
 
 
 @eqx.filter_jit
-def weighted_residuals(likelihood: FrameLikelihood, own: Residuals, before: Float[Array, "n 3"]) -> WeightedResiduals:
-    """Return weighted residuals, from those of the frame and the positions of the one before."""
-    now = likelihood.forces(own.positions) + own.unbalanced
-    i = likelihood.innovation(now, likelihood.forces(before))[:, :, None]
+def weighted_residuals(likelihood: FrameLikelihood, own: Residuals, before: SheetResiduals) -> WeightedResiduals:
+    """Return weighted residuals, from those of the frame and those that its errors follow."""
+    innovation = likelihood.persistence.innovation
+    positions, unbalanced = map(innovation, own.sheet, before)
+    i = (likelihood.forces(positions) + unbalanced)[:, :, None]
     products = likelihood.dot(jnp.concatenate([likelihood.fields, i], axis=2), i, likelihood.whitened(i))[:, 0]
     return WeightedResiduals(own=own, before=before, innovation=i[:, :, 0], squared=products[-1], common=products[:-1])
 

@@ -40,19 +40,19 @@ class NoiseScales:
     """Variance of the measured force of the tool; None where none was measured."""
     noise: float | None = None
     """Variance of all errors of positions and of the forces on them; None, as assumed, where the noise was measured."""
-    persistence: float = 0.0
+    autocorrelation: float = 0.0
     """Autocorrelation of the errors of a frame and of the next one; no variance."""
 
     @property
     def variances(self) -> dict[str, float]:
         """Return the variances by name."""
-        values = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "persistence"}
+        values = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "autocorrelation"}
         return {name: value for name, value in values.items() if value is not None}
 
     def __str__(self) -> str:
         """Return the variances and the autocorrelation as text."""
         sizes = ", ".join(f"{name} {value:.2g}" for name, value in self.variances.items())
-        return f"{sizes} times the assumed variance, autocorrelation {self.persistence:.3g}"
+        return f"{sizes} times the assumed variance, autocorrelation {self.autocorrelation:.3g}"
 
     def log_prior(self) -> float:
         """Return the log density of the variances' logarithms and of the autocorrelation [nat]."""
@@ -82,19 +82,14 @@ def _log_larger(variance: float) -> float:
 
 def likeliest_variance(squared: float, degrees: float) -> float:
     """Return the likeliest variance of a number of residuals, from their squared sum."""
-    return largest_variance(lambda variance: -0.5 * (squared / variance + degrees * float(np.log(variance))))
+    return likeliest_under(lambda variance: -0.5 * (squared / variance + degrees * float(np.log(variance))))
 
 
-def largest_variance(log_likelihood: Callable[[float], float]) -> float:
-    """Return the variance of largest posterior."""
+def likeliest_under(log_likelihood: Callable[[float], float]) -> float:
+    """Return the variance of largest posterior under a log likelihood of it [nat]."""
 
     def minus(log_variance: float) -> float:
         return -log_likelihood(float(np.exp(log_variance))) - log_prior(float(np.exp(log_variance)))
 
-    return float(np.exp(minimum(minus, LOG_RANGE, 1e-5)))
-
-
-def minimum(function: Callable[[float], float], bounds: tuple[float, float], tolerance: float) -> float:
-    """Return where a function of one number is least between two bounds, up to a tolerance."""
-    found: OptimizeResult = minimize_scalar(function, bounds=bounds, method="bounded", options={"xatol": tolerance})
-    return float(found["x"])
+    found: OptimizeResult = minimize_scalar(minus, bounds=LOG_RANGE, method="bounded", options={"xatol": 1e-5})
+    return float(np.exp(found["x"]))

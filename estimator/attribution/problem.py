@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..belief.attachment_belief import AttachmentBelief
 from ..belief.prior import prior_belief
@@ -20,6 +20,7 @@ from ..physics.mesh import SheetMesh
 from .dataset import Dataset
 from .grasped_frames import Timed
 from .noise_scales import NoiseScales
+from .persistence import Persistence
 from .sheet import PredictedSheet
 
 NUISANCE = {
@@ -92,23 +93,39 @@ class Problem:
         grasp = self.history.frames[k].grasp
         return max((j for j in frames if j < k and self.history.frames[j].grasp == grasp), default=None)
 
-    def frames_since(self, k: int, before: int | None) -> int:
-        """Return the number of frames of the recording from another one to frame k; from rest, its begin, if None."""
-        index = 0 if before is None else self.history.frames[before].index
-        return max(self.history.frames[k].index - index, 1)
+    def last_seen(self, k: int, frames: Iterable[int]) -> Int[np.ndarray, " n"]:
+        """Return the last of some frames before frame k in its grasp that observed each particle; -1 if none did.
 
-    def persistence(self, k: int, frames: Iterable[int]) -> tuple[float, float]:
-        """Return the `autocorrelation` of frame k and the last of some frames before it, and what is `new` since."""
-        before = self.before(k, frames)
-        return self.autocorrelation(k, before), self.new(k, before)
+        For particles that frame k does not observe itself, it is the last of those frames.
+        """
+        timed = self.history.frames
+        earlier = sorted((j for j in frames if j < k and timed[j].grasp == timed[k].grasp), reverse=True)
+        last = np.where(timed[k].counted, -1, earlier[0] if earlier else -1)
+        for j in earlier:
+            last = np.where((last < 0) & timed[j].counted, j, last)
+            if (last >= 0).all():
+                break
+        return last
 
-    def new(self, k: int, before: int | None) -> float:
-        """Return the variance of what is new of the errors of frame k since another one, over the assumed one."""
-        return (self.scales.noise or 1.0) * (1 - self.autocorrelation(k, before) ** 2)
+    def frames_since(self, k: int, last: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+        """Return the number of frames of the recording from others to frame k; from rest, its begin, for -1."""
+        index = np.append([one.index for one in self.history.frames], 0)
+        return np.maximum(index[k] - index[last], 1)
 
-    def autocorrelation(self, k: int, before: int | None) -> float:
-        """Return the autocorrelation of the errors of frame k and of another one, or of rest."""
-        return self.scales.persistence ** self.frames_since(k, before)
+    def frames_driven(self, k: int, frames: Iterable[int]) -> int:
+        """Return the number of frames since the last of some frames before frame k in its grasp, or since it began."""
+        before, timed = self.before(k, frames), self.history.frames
+        if before is not None:
+            return timed[k].index - timed[before].index
+        return timed[k].index - min(one.index for one in timed if one.grasp == timed[k].grasp) + 1
+
+    def persistence(self, k: int, frames: Iterable[int]) -> Persistence:
+        """Return how the errors of frame k follow those of some frames before it."""
+        frames = list(frames)
+        since = self.frames_since(k, self.last_seen(k, frames))
+        return Persistence.of(
+            self.scales.autocorrelation, self.scales.noise or 1.0, since, self.frames_driven(k, frames)
+        )
 
     @classmethod
     def build(cls, dataset: Dataset, library: tuple[Effect, ...]) -> "Problem":

@@ -1,7 +1,9 @@
 """A small attribution problem and fits of it with given numbers, for tests that need no predictions."""
 
+from dataclasses import replace
 from functools import cache
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -75,3 +77,12 @@ def small_fit(
         summary=summary,
         log_likelihood=0.0,
     )
+
+
+def with_hidden(problem: Problem, hidden: dict[int, list[int]]) -> Problem:
+    """Return a problem in which some frames do not observe some particles."""
+    timed = list(problem.history.frames)
+    for k, particles in hidden.items():
+        visible = timed[k].frame.visible.at[jnp.asarray(particles)].set(False)
+        timed[k] = replace(timed[k], frame=eqx.tree_at(lambda f: f.visible, timed[k].frame, visible))
+    return replace(problem, history=FrameHistory(timed, np.asarray(problem.history.rest)))

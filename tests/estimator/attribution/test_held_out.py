@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jiggle_mj.estimator.attribution import held_out
 from jiggle_mj.estimator.attribution.every_frame import weighed
 from jiggle_mj.estimator.attribution.frame_likelihood import seen_noise
 from jiggle_mj.estimator.attribution.gauss_newton import start, weigh
@@ -86,7 +87,7 @@ def test_errors_that_were_seen_persist(shared):
     own = [k for k, one in enumerate(problem.history.frames) if one.grasp == grasp]
     frames = [replace(one, part=99 if k == own[-1] else one.part) for k, one in enumerate(problem.history.frames)]
     problem = replace(problem, history=FrameHistory(frames, np.asarray(problem.history.rest)))
-    drifting = problem.with_scales(replace(problem.scales, persistence=0.95))
+    drifting = problem.with_scales(replace(problem.scales, autocorrelation=0.95))
     with jax.enable_x64(True), one_thread():
         fits = []
         for one in (problem, erring(drifting, own, 3 * w)):
@@ -99,3 +100,27 @@ def test_errors_that_were_seen_persist(shared):
     assert alone.rms > 1.5 * still.rms
     assert on.rms < 0.5 * (still.rms + alone.rms)
     assert on.variances.others.sum() < 0.5 * still.variances.others.sum()
+
+
+def test_what_the_fit_leaves_open_of_the_last_frame_is_known_by_its_error(light, monkeypatch):
+    """While all rests, each frame is as the last one: of what is unsure of it, the share 1 - rho is left."""
+    monkeypatch.setattr(held_out, "from_rest", lambda problem, point, frames, by_tool: point)
+    fitted = light[0].declared.fitted
+    problem, last = fitted.problem, list(fitted.equations)[-1]
+    rests = [fitted.problem.history.frames[last]] * 4
+    gap = rests[0].time - fitted.problem.history.frames[last - 1].time
+    rests = [
+        replace(one, index=one.index + j, time=one.time + j * gap, part=99 if j == 3 else one.part)
+        for j, one in enumerate(rests)
+    ]
+    states = np.repeat(fitted.point.states[[last]], 4, axis=0)
+    variances = []
+    with jax.enable_x64(True), one_thread():
+        for autocorrelation in (0.0, 0.8):
+            one = problem.with_scales(replace(problem.scales, autocorrelation=autocorrelation))
+            one = replace(one, history=FrameHistory(rests, np.asarray(problem.history.rest)))
+            point = replace(fitted.point, states=states, seen=states)
+            known = replace(fitted, problem=one, point=point, weights=dict.fromkeys(range(3), fitted.weights[last]))
+            variances.append(predict_held_out(known, 99).variances)
+    np.testing.assert_allclose(variances[1].fit, 0.2**2 * variances[0].fit, rtol=1e-6)
+    np.testing.assert_allclose(variances[1].others, (1 - 0.8**2) * variances[0].others, rtol=1e-6)

@@ -23,7 +23,7 @@ CHANGES = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 """Factors by which each variance is changed."""
 LOSS = 0.5
 """Log posterior by which the search may fall short: twice the gain that it is not worth going on for [nat]."""
-STEP = 1e-3
+STEP = 1e-2
 """Change of the logarithm of a variance in the differences."""
 
 
@@ -85,7 +85,8 @@ def test_a_likelihood_with_another_force_error_is_the_one_built_with_it(begun):
     point, noise = begun.point, jnp.asarray(problem.noise)
     frame, states = problem.history.frames[k].frame, jnp.asarray(point.states)
     context, theta, s = problem.history.context(k, states), jnp.asarray(point.theta), jnp.asarray(point.s)
-    built = frame_likelihood(other.sheet, theta, s, frame, context, states[k], noise)
+    persistence = problem.persistence(k, list(begun.weights))
+    built = frame_likelihood(other.sheet, theta, s, frame, context, states[k], noise, persistence)
     changed = with_force_sd(begun.weights[k], other.sheet.balance.force_sd, frame, noise)
     for one, two in zip(jax.tree.leaves(built), jax.tree.leaves(changed), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-7 * float(np.abs(one).max(initial=0.0)))

@@ -11,6 +11,7 @@ from jiggle_mj.estimator.attribution.gauss_newton import linearise_at, moved, st
 from jiggle_mj.estimator.attribution.likelihood_slope import likelihood_slopes, whole_slope
 from jiggle_mj.estimator.attribution.refinement import refined
 from jiggle_mj.estimator.blas import one_thread
+from tests.support.small_fit import with_hidden
 
 STEP = 1e-3
 """Change of a parameter [prior sd], and of s, in the differences."""
@@ -24,15 +25,19 @@ RTOL, ATOL = 0.1, 0.05
 
 
 @pytest.mark.parametrize(
-    ("shared", "persistence"),
+    ("shared", "autocorrelation"),
     [(False, 0.5), pytest.param(True, 0.0, marks=pytest.mark.slow), pytest.param(True, 0.5, marks=pytest.mark.slow)],
     ids=["white noise that persists", "noise that neighbours share", "noise that neighbours share and that persists"],
 )
-def test_the_slope_is_that_of_finite_differences(light, shared, persistence):
-    """The differences are of states that are predicted anew, so that weights and determinants change with them."""
+def test_the_slope_is_that_of_finite_differences(light, shared, autocorrelation):
+    """The differences are of states that are predicted anew, so that weights and determinants change with them.
+
+    Some particles are hidden for a frame, so that their errors follow those of frames before.
+    """
     fitted = light[0].final.fitted
     problem, frames = fitted.problem, list(fitted.equations)[::3]
-    problem = problem.with_scales(replace(problem.scales, persistence=persistence))
+    problem = problem.with_scales(replace(problem.scales, autocorrelation=autocorrelation))
+    problem = with_hidden(problem, {frames[1]: [0, 7], frames[-2]: [3]})
     if shared:
         x = np.asarray(problem.sheet.balance.energy.rest)
         problem = replace(problem, assumed_noise=2e-4 * np.column_stack([np.ones(len(x)), np.cos(30 * x[:, 0])]))
