@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..parallel_map import parallel_map
-from .every_frame import in_common, residual, weighted_together
+from .every_frame import in_common, weighted_together
 from .frame_errors import ForceErrors, force_errors
 from .frame_likelihood import N_FIELDS, FrameLikelihood, with_force_sd, with_noise
 from .gauss_newton import Weighed, evaluated
@@ -86,7 +86,7 @@ def with_force(at: Weighed, log_force: float) -> Weighed:
     frames, noise = problem.history.frames, jnp.asarray(problem.noise)
     force_sd = problem.sheet.balance.force_sd
     weights = parallel_map(lambda k: with_force_sd(at.weights[k], force_sd, frames[k].frame, noise), at.weights)
-    return _with_likeliest_others(problem, at.point, weights, residual(problem, weights, at.point))
+    return _with_likeliest_others(problem, at.point, weights, at.residuals)
 
 
 def with_likeliest_others(at: Weighed) -> Weighed:
@@ -97,6 +97,7 @@ def with_likeliest_others(at: Weighed) -> Weighed:
 def _with_likeliest_others(
     problem: Problem, point: Point, weights: dict[int, FrameLikelihood], residuals: dict[int, WeightedResiduals]
 ) -> Weighed:
+    """Return a point with its likeliest other scales, from residuals that other weights may have weighted."""
     problem, weights, residuals = _with_likeliest_noise(problem, weights, residuals)
     scales, with_force = problem.scales, problem.with_force(weights)
     scales = replace(
