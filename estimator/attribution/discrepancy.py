@@ -103,7 +103,7 @@ def _led(lead: float) -> str:
     """Return by how much the likeliest hypothesis leads; with fewer effects it may be likelier by its prior alone."""
     if lead >= 0:
         return f"leads by {lead:.0f} nat"
-    return f"is likelier before any frame is seen, by more than the {-lead:.0f} nat of these"
+    return f"is likelier by its prior, although these have {-lead:.0f} nat more"
 
 
 def _probability(one: Hypothesis, probability: float) -> dict[str, Any]:

@@ -152,7 +152,7 @@ def _frames(dataset: Dataset, place: int, pull: Float[np.ndarray, " 3"], *, gap:
                 by_points=like.by_points,
                 held_sd=like.held_sd,
             ),
-            index=last.index + 1 + k,
+            index=last.index + 1 + round(since / gap),
             grasp=grasp,
             part=last.part + 1,
             time=began + since,
@@ -160,7 +160,7 @@ def _frames(dataset: Dataset, place: int, pull: Float[np.ndarray, " 3"], *, gap:
             state=rest,
             reports=((began + since, share * pull),),
         )
-        for k, (since, share) in enumerate(moves)
+        for since, share in moves
     ]
 
 

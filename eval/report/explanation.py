@@ -85,7 +85,7 @@ def _place(chosen: list[int], particles: Mapping[str, Any]) -> str:
             others = rest[np.array(particles[key], dtype=bool)]
             distance = np.linalg.norm(rest[:, None] - others[None], axis=2).min(axis=1)
             found[words] = float(np.median(distance[chosen])), float(np.median(distance))
-    near = [words for words, (own, of_all) in found.items() if own <= NEAR * of_all]
+    near = [words for words, (own, of_all) in found.items() if of_all > 0 and own <= NEAR * of_all]
     if not near:
         return ""
     words = min(near, key=lambda one: found[one][0] / found[one][1])

@@ -36,6 +36,14 @@ def test_the_file_and_the_page_hold_the_result(light, tmp_path):
     assert f"Added: {found['effects'][0]['name']}" in (tmp_path / "a.html").read_text()
 
 
+def test_the_page_says_by_how_much_errors_persist(light):
+    """With the keys that the file has, for another autocorrelation."""
+    _, found, _ = light
+    persistent = found | {"noise": found["noise"] | {"autocorrelation": 0.99}}
+    (sentence,) = set(story(persistent)) - set(story(found))
+    assert sentence.startswith("Errors persist") and "0.99" in sentence
+
+
 def test_the_probabilities_of_hypotheses_come_first(light):
     _, found, _ = light
     shares = [one["probability"] for one in found["posterior"]]

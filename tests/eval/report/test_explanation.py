@@ -38,6 +38,9 @@ def test_the_sentence_names_the_frames_and_particles_with_half_of_the_evidence()
 def test_particles_that_are_everywhere_are_near_nothing():
     found = explanation_sentence(ONE | {"particles_nat": [9] * 11}, PARTICLES | {"held": [False] * 11})
     assert found.endswith("and on 6 of 11 particles.")
+    most = {"held": [False] * 11, "attached": [True] * 8 + [False] * 3}
+    found = explanation_sentence(ONE | {"particles_nat": [9] * 11}, PARTICLES | most)
+    assert found.endswith("and on 6 of 11 particles.")
 
 
 def test_frames_that_speak_against_a_hypothesis_are_not_what_it_rests_on():
