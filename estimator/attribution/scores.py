@@ -1,11 +1,13 @@
 """Score statistics of all effects at a fit, with stiffnesses, nuisance parameters and smooth fields marginalised.
 
-With V the marginal information about an effect's parameters, g its score and the prior theta ~ N(0, Theta),
+With V the marginal information about an effect's parameters, g its score at theta and the prior theta ~ N(0, Theta),
 
-    ln BF = g^T (V + Theta^-1)^-1 g / 2 - ln |I + Theta V| / 2
+    ln Z = [h^T (V + Theta^-1)^-1 h - theta^T Theta^-1 theta - ln |I + Theta V|] / 2,    h = g - Theta^-1 theta,
 
-for each site, and the mean of the Bayes factors over the sites. An effect whose derivatives at 0 show little of it is
-also fitted from its initial guesses, for a few steps.
+is the log evidence of each site over the likelihood at theta. That of the effect's absence is subtracted: 0, as theta
+is then 0; or, where the effect is a nuisance parameter too, ln Z of the prior that it has as such. These Bayes factors
+are averaged over the sites. An effect whose derivatives at 0 show little of it is also fitted from its initial guesses,
+for a few steps.
 
 The errors have their likeliest variances, so that the score of one effect is a lower bound of what a fit gains by it:
 without it, all that it would explain counts as errors. The residuals of the tool and of its force are so few that this
@@ -111,28 +113,44 @@ def _score(
     """Return the score at one site, from the information with s marginalised, and the products of all columns."""
     problem = fitted.problem
     mine = problem.sheet.place(effect.name, site)
-    others = ~np.isin(fitted.free, mine)
+    others, at = ~np.isin(fitted.free, mine), fitted.point.theta[mine]
     rest, sd_rest = fitted.free[others], problem.sd(fitted.named)[others]
     joint = left.restricted(effect=mine, nuisance=rest)
     joint = joint.with_independent("nuisance", sd_rest**-2, -fitted.point.theta[rest] / sd_rest**2)
     own, sd, eye = joint.marginal("effect"), problem.prior_sd[mine], np.eye(len(mine))
     unit, scaled = own.precision * np.outer(sd, sd), own.shift * sd
-    posterior = GaussianInformation(precision=unit + eye, shift=scaled)
-    theta = posterior.mean()
-    senseless = sd[0] * theta[0] < problem.lower_bounds(mine)[0]
-    evidence = (0.0 if senseless else 0.5 * scaled @ theta) - 0.5 * posterior.log_det()
+    lower = problem.lower_bounds(mine)[0]
+    step, evidence = step_and_evidence(own, at, sd, lower)
+    if (nuisance := np.isin(problem.own, mine)).any():
+        evidence -= step_and_evidence(own, at, problem.own_sd[nuisance], lower)[1]
     regularisation = SINGULAR * max(float(np.trace(unit)), MIN_TRACE)
     statistic = float(scaled @ np.linalg.solve(unit + regularisation * eye, scaled))
     raw = whole[np.ix_(mine, mine)] * np.outer(sd, sd)
     kept = np.linalg.eigvals(np.linalg.solve(raw + SINGULAR * max(np.trace(raw), MIN_TRACE) * eye, unit)).real.min()
     return Score(
         name=effect.name,
-        log_bayes_factor=float(evidence),
+        log_bayes_factor=evidence,
         site=site,
-        theta=sd * theta,
+        theta=step,
         p_value=float(chi2.sf(statistic, len(mine))),
         kept=float(np.clip(kept, 0, 1)),
     )
+
+
+def step_and_evidence(
+    own: GaussianInformation, at: Float[np.ndarray, " p"], sd: Float[np.ndarray, " p"], lower: float
+) -> tuple[Float[np.ndarray, " p"], float]:
+    """Return the linear step of parameters from `at` under a prior, and its log evidence over the likelihood there.
+
+    Where the first one would be below its lower bound, there is no step.
+    """
+    unit = own.precision * np.outer(sd, sd) + np.eye(len(sd))
+    posterior = GaussianInformation(precision=unit, shift=own.shift * sd - at / sd)
+    step = posterior.mean()
+    if at[0] + sd[0] * step[0] < lower:
+        step = np.zeros(len(sd))
+    evidence = 0.5 * posterior.shift @ step - 0.5 * np.sum((at / sd) ** 2) - 0.5 * posterior.log_det()
+    return sd * step, float(evidence)
 
 
 def _from_initial_guesses(fitted: Fitted, score: Score) -> Score:

@@ -5,11 +5,13 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from jiggle_mj.estimator.attribution import gauss_newton as stepping
 from jiggle_mj.estimator.attribution.fit import fit, without
 from jiggle_mj.estimator.attribution.gauss_newton import moved
-from jiggle_mj.estimator.attribution.scores import parameters_sd
+from jiggle_mj.estimator.attribution.scores import parameters_sd, step_and_evidence
+from jiggle_mj.estimator.belief.gaussian_information import GaussianInformation
 from jiggle_mj.estimator.blas import one_thread
 
 SIZE_ERROR = 0.03
@@ -122,3 +124,20 @@ def test_a_fit_without_a_part_uses_the_other_frames_alone(light):
     with jax.enable_x64(True), one_thread():
         rest = without(fitted, part)
     assert rest.equations and all(rest.problem.history.frames[k].part != part for k in rest.equations)
+
+
+@pytest.mark.parametrize(("sd", "lower"), [(0.05, -np.inf), (0.4, -np.inf), (0.4, 0.1)])
+def test_the_evidence_of_a_step_is_the_integral_over_the_prior(sd, lower):
+    """Of a likelihood that is normal about 0.176, linearised at 0.14; by a sum over many values."""
+    own = GaussianInformation(precision=np.array([[1600.0]]), shift=np.array([57.6]))
+    step, evidence = step_and_evidence(own, np.array([0.14]), np.array([sd]), lower)
+    theta = np.linspace(-1.5, 1.5, 300_001)
+    over_here = np.exp(57.6 * (theta - 0.14) - 800 * (theta - 0.14) ** 2)
+    assert evidence == pytest.approx(np.log(np.trapezoid(over_here * norm.pdf(theta, scale=sd), theta)), abs=1e-6)
+    assert 0.14 + step[0] == pytest.approx(0.176 * 1600 / (1600 + sd**-2))
+
+
+def test_a_step_beyond_the_lower_bound_is_none():
+    own = GaussianInformation(precision=np.array([[1600.0]]), shift=np.array([-57.6]))
+    step, evidence = step_and_evidence(own, np.zeros(1), np.array([0.4]), 0.0)
+    assert step[0] == 0 and evidence == pytest.approx(-0.5 * np.log1p(1600 * 0.4**2))
