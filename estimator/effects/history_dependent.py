@@ -80,6 +80,7 @@ HISTORY_DEPENDENT = (
         prior_sd=(0.3,),
         source="wet bowel 0.01 to 0.05, muscle 0.3",
         confounded_with=("tissue_creep", "attachments"),
+        initial_guesses=((0.3,),),  # at 0 its nuisance parameter takes its place
         non_negative=True,
     ),
     Effect(
