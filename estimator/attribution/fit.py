@@ -100,17 +100,17 @@ def _with_likeliest_scales(now: Fitted, log: Callable[[str], None] = lambda _: N
 
 
 def without(fitted: Fitted, part: int) -> Fitted:
-    """Return one more step from a fit without the frames of one part, from the normal equations that it has.
+    """Return one more step from a fit without the frames of one part.
 
     The likeliest set of attachments is no candidate: of many equally likely sets, fewer frames would take another one
     at random.
     """
-    now = kept_frames(fitted, part)
+    now = weighed_without(fitted, part)
     better = better_point(now, candidate_steps(now, likeliest_set=False))
     return now if better is None else replace(now, point=better.point, log_likelihood=better.log_likelihood)
 
 
-def kept_frames(fitted: Fitted, part: int) -> Fitted:
+def weighed_without(fitted: Fitted, part: int) -> Fitted:
     """Return a fit's point without the frames of one part, as if they had never been."""
     problem, every = fitted.problem, fitted.weights
     kept = [k for k in every if problem.history.frames[k].part != part]

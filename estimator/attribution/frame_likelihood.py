@@ -1,22 +1,22 @@
 """Likelihood of one frame's observed positions, linearised at its predicted state.
 
 Let e = y - h(x) be the residual of the positions, with x the predicted equilibrium. Errors of a frame persist in the
-next one of the grasp, as an autoregressive process of order 1 [Box, Jenkins & Reinsel 2008, doi:10.1002/9781118619193,
-section 3.2]. With rho the autocorrelation of frame k and the one before it, or of rest, where e = 0, and kappa the
-variance of all errors over the assumed one, the forces of the innovation are
+next one of the grasp, as an autoregressive process of order 1 [Box, Jenkins & Reinsel, Time Series Analysis, 4th
+edition 2008, section 3.2]. With rho the autocorrelation of a particle's error and of its last one, or of rest, where
+e = 0, and kappa the variance of all errors over the assumed one (`persistence`), the forces of the innovation are
 
-    i = H (e_k - rho e_(k-1)) / sqrt(kappa (1 - rho^2)).
+    i = H (e_k - rho e_last) / sqrt(kappa (1 - rho^2)).
 
 Let N be the covariance of the model's force errors and of the noise of observed positions, mapped to forces by H. Then
 
     i + H F a + Q c = n,    n ~ N(0, N),  a ~ N(0, I),  c ~ N(0, amplitude^2 I)
 
-with F the smooth fields of the noise, and Q smooth force fields that stand for any other error of the model and are the
-same in all frames of a grasp. So the log density of the positions is, given those before and for c = 0,
+with F the smooth fields of the noise, and Q smooth force fields that stand for any other error of the model and drive
+all frames of a grasp alike. So the log density of the positions is, given those before and for c = 0,
 
-    -1/2 [i^T (N + H F F^T H^T)^-1 i + ln |N + H F F^T H^T| - 2 ln |H| + m ln (kappa (1 - rho^2))]
+    -1/2 [i^T (N + H F F^T H^T)^-1 i + ln |N + H F F^T H^T| - 2 ln |H| + sum ln (kappa (1 - rho^2))]
 
-up to a constant, with m the number of observed coordinates. A model that yields more has a wider density, so a
+up to a constant, with the sum over observed coordinates. A model that yields more has a wider density, so a
 comparison of models needs both determinants. c is eliminated grasp by grasp (`normal_equations.common`).
 """
 
@@ -110,7 +110,7 @@ class FrameLikelihood(eqx.Module):
     def log_determinant(self) -> Float[Array, ""]:
         """Return ln |C| of the observed positions' covariance C, up to the precision of their white noise.
 
-        It is ln |N + H F F^T H^T| - 2 ln |H| + m ln (kappa (1 - rho^2)). Rows without a force equation are those of
+        It is ln |N + H F F^T H^T| - 2 ln |H| + sum ln (kappa (1 - rho^2)). Rows without a force equation are those of
         inputs, and do not count.
         """
         w, known = self.frame.weight, self.frame.weight > 0

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
 
 from ..belief.gaussian_information import GaussianInformation
@@ -108,25 +108,24 @@ def predict_held_out(fitted: Fitted, part: int, *, persistent: bool = True) -> H
     """
     problem = fitted.problem
     frames, closed = problem.frames({part}), problem.history.frames
-    last = {k: problem.last_seen(k, fitted.weights) for k in frames}
+    known_errors = list(fitted.weights) if persistent else []
+    last = {k: problem.last_seen(k, known_errors) for k in frames}
     lasts = sorted({int(j) for one in last.values() for j in one[one >= 0]})
     predicted = from_rest(problem, fitted.point, [*lasts, *frames], by_tool=True)
     error = {k: np.asarray(closed[k].frame.y) - predicted.seen[k] for k in [*lasts, *frames]}
 
     def residual(k: int) -> Float[np.ndarray, "m 3"]:
-        found = error[k]
-        if persistent:
-            rho = np.asarray(problem.persistence(k, fitted.weights).autocorrelation)
-            found = found - rho[:, None] * carried(last[k], error, np.zeros_like(found))
+        rho = np.asarray(problem.persistence(k, known_errors).autocorrelation)
+        found = error[k] - rho[:, None] * np.asarray(carried(last[k], error, np.zeros_like(error[k])))
         return found[closed[k].counted]
 
     def variances() -> Variances:
         known = _covariance(fitted)
-        weights = weighed(problem, predicted, [*lasts, *frames], among=fitted.weights)
-        by_fit = {j: _of_particles(responses(fitted, predicted, weights[j], j)[1]) for j in lasts}
+        weights = weighed(problem, predicted, [*lasts, *frames], among=known_errors)
+        by_fit = parallel_map(lambda j: _of_particles(responses(fitted, predicted, weights[j], j)[1]), lasts)
 
         def one(k: int) -> Variances:
-            return _variances(fitted, predicted, weights[k], k, by_fit, known)
+            return _variances(fitted, predicted, weights[k], k, last[k], by_fit, known)
 
         every = parallel_map(one, frames)
         return Variances(
@@ -190,6 +189,7 @@ def _variances(
     predicted: Point,
     likelihood: FrameLikelihood,
     k: int,
+    last: Int[np.ndarray, " n"],
     by_fit_before: dict[int, Float[np.ndarray, "n 3 k"]],
     known: Float[np.ndarray, "k k"],
 ) -> Variances:
@@ -200,11 +200,12 @@ def _variances(
         predicted: the prediction.
         likelihood: weights at the predicted state.
         k: the frame.
+        last: the fitted frame that the error of each particle follows; -1 if none.
         by_fit_before: how the residuals of the last fitted frames move with s and theta.
         known: covariance of s and parameters.
     """
     problem, n = fitted.problem, len(likelihood.seen)
-    closed, last = problem.history.frames[k].frame, problem.last_seen(k, fitted.weights)
+    closed = problem.history.frames[k].frame
     by_force, by_fit = responses(fitted, predicted, likelihood, k)
     by_fit = _of_particles(by_fit)
     rho, new = (np.asarray(one) for one in (likelihood.persistence.autocorrelation, likelihood.persistence.new))

@@ -26,8 +26,8 @@ from .problem import Problem
 STARTS = (0.0, 0.5, 0.9, 0.99, 0.999)
 """Autocorrelations from which the search begins, beside the last one; the largest is the largest possible: beyond it,
 errors add up as those of a random walk do."""
-TOLERANCE, ENOUGH = 0.02, 0.05
-"""Tolerances of the logarithms of v and of 1 - rho, and of the log posterior [nat]."""
+LOG_TOLERANCE, RELATIVE_TOLERANCE = 0.02, 1e-5
+"""Tolerances of the logarithms of v and of 1 - rho, and of the log posterior, relative to itself."""
 
 
 class _Products(eqx.Module):
@@ -57,8 +57,8 @@ class GraspProducts(NamedTuple):
     """Frames since each group was last observed."""
     observed: Float[np.ndarray, "t g"]
     """Numbers of their observed coordinates."""
-    driven: tuple[int, ...]
-    """Frames since the frame before, or since the grasp began."""
+    steps: tuple[tuple[int, ...], ...]
+    """Frames from each frame of the grasp to the next, since the one before; see `Problem.steps`."""
 
     def misfit(self, factor: float, autocorrelation: float, amplitude: float) -> tuple[float, float]:
         """Return the squared innovations and the log determinant [nat, doubled], of noise of the assumed size.
@@ -70,7 +70,7 @@ class GraspProducts(NamedTuple):
         left = self.under - np.einsum("tck,tcl->tkl", scaled, scaled)
         rho = autocorrelation**self.since
         by = np.concatenate([np.ones_like(rho), -rho], axis=1) / np.tile(np.sqrt(1 - rho**2), 2)
-        driven = np.array([drive(autocorrelation, frames) for frames in self.driven])
+        driven = np.array([drive(autocorrelation, steps) for steps in self.steps])
         squared = float(np.einsum("ta,tab,tb->", by, left[:, N_FIELDS:, N_FIELDS:], by))
         of_fields = np.einsum("t,tqa,ta->q", driven, left[:, :N_FIELDS, N_FIELDS:], by)
         among = np.einsum("t,tqr->qr", driven**2, left[:, :N_FIELDS, :N_FIELDS])
@@ -104,10 +104,8 @@ def likeliest_noise(
     starts = [at(last.smooth, rho) for rho in dict.fromkeys((last.autocorrelation, *STARTS))]
     best = min(starts, key=lambda one: one[1])[0]
     begin = np.array([np.log1p(-best.autocorrelation), np.log(best.smooth)])[: len(bounds)]
-    options = {"xatol": TOLERANCE, "fatol": ENOUGH}
-    found: OptimizeResult = minimize(
-        lambda place: of(place)[1], begin, bounds=bounds, method="Nelder-Mead", options=options
-    )
+    options = {"xtol": LOG_TOLERANCE, "ftol": RELATIVE_TOLERANCE}
+    found: OptimizeResult = minimize(lambda place: of(place)[1], begin, bounds=bounds, method="Powell", options=options)
     return min(*starts, of(found["x"]), key=lambda one: one[1])[0]
 
 
@@ -135,7 +133,7 @@ def grasps_of(
             values=np.array([found[k][0].values for k in frames]),
             since=np.array([times[k] for k in frames], dtype=float),
             observed=np.array([found[k][1] for k in frames], dtype=float),
-            driven=tuple(problem.frames_driven(k, weights) for k in frames),
+            steps=tuple(problem.steps(k, weights) for k in frames),
         )
         for frames in problem.by_grasp(weights).values()
     ]

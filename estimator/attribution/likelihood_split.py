@@ -1,10 +1,10 @@
 """Split the log likelihood of a fit exactly over its frames and particles.
 
 With the smooth force fields c and the tool's offset o of each grasp at their likeliest values, i the innovation of the
-frame's forces and C its covariance with m coordinates observed (see `frame_likelihood`), t the tool's residual and v
+frame's forces and C its covariance (see `frame_likelihood`), t the tool's residual and v
 the variance of its scale, frame k has
 
-    -1/2 [z^T C^-1 z + ln |C| - 2 ln |H| + m ln (kappa (1 - rho^2)) + |t - o|^2 / v + 3 ln v],   z = i + Q c,
+    -1/2 [z^T C^-1 z + ln |C| - 2 ln |H| + sum ln (kappa (1 - rho^2)) + |t - o|^2 / v + 3 ln v],   z = i + Q c,
 
 and each grasp, for what its frames share,
 

@@ -4,10 +4,13 @@ The error of each position is an autoregressive process of order 1 from rest, wh
 autocorrelation of a frame and the next and kappa the variance, the error e of a particle that was last observed t
 frames before has, given its error then, the mean rho^t e_last and the variance kappa (1 - rho^2t).
 
-What drives the errors of all frames of a grasp alike by c standard deviations of what is new in one frame moves those
-of t frames later by c f standard deviations of what is new since then, with
+The errors of particles are taken for correlated with each other as what is new in a frame is, where they were hidden
+for different times too. Grasps count as independent.
 
-    f = sum_(j < t) rho^j / sqrt(sum_(j < t) rho^2j).
+What drives the errors of all frames of a grasp alike, each by c standard deviations of what is new in it, moves those
+of a frame by c f standard deviations of what is new since the last frame that is used. From each frame to the next
+
+    d <- rho^t d + sqrt(1 - rho^2t),   q <- rho^2t q + 1 - rho^2t,   f = d / sqrt(q).
 """
 
 from typing import TypeVar
@@ -32,20 +35,22 @@ class Persistence(eqx.Module):
     """Factor f of what drives the errors of all frames alike."""
 
     @classmethod
-    def of(cls, autocorrelation: float, variance: float, since: Int[np.ndarray, " n"], driven: int) -> "Persistence":
+    def of(
+        cls, autocorrelation: float, variance: float, since: Int[np.ndarray, " n"], steps: tuple[int, ...]
+    ) -> "Persistence":
         """Return it for an autocorrelation of a frame and the next, and the variance of all errors.
 
         Args:
             autocorrelation: rho.
             variance: kappa, over the assumed variance.
             since: frames since each particle was last observed, or since rest.
-            driven: frames since the frame before, or since the grasp began.
+            steps: frames from each frame to the next, from the last one that is used to this one.
         """
         rho = autocorrelation ** since.astype(float)
         return cls(
             autocorrelation=jnp.asarray(rho),
             new=jnp.asarray(variance * new_share(autocorrelation, since)),
-            drive=jnp.asarray(drive(autocorrelation, driven)),
+            drive=jnp.asarray(drive(autocorrelation, steps)),
         )
 
     def innovation(self, now: Float[Array, "n ..."], before: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
@@ -59,10 +64,13 @@ def new_share(autocorrelation: float, frames: Int[np.ndarray, " n"]) -> Float[np
     return 1 - autocorrelation ** (2.0 * frames)
 
 
-def drive(autocorrelation: float, frames: int) -> float:
-    """Return the factor of what drives the errors of all frames alike, some frames later."""
-    powers = autocorrelation ** np.arange(frames, dtype=float)
-    return float(powers.sum() / np.sqrt(np.sum(powers**2)))
+def drive(autocorrelation: float, steps: tuple[int, ...]) -> float:
+    """Return the factor f of what drives the errors of all frames alike, after some steps of so many frames."""
+    driven, variance = 0.0, 0.0
+    for frames in steps:
+        rho = autocorrelation**frames
+        driven, variance = rho * driven + (1 - rho**2) ** 0.5, rho**2 * variance + 1 - rho**2
+    return driven / variance**0.5
 
 
 def carried(last: Int[np.ndarray, " n"], every: dict[int, T], nothing: T) -> T:

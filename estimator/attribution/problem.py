@@ -112,20 +112,22 @@ class Problem:
         index = np.append([one.index for one in self.history.frames], 0)
         return np.maximum(index[k] - index[last], 1)
 
-    def frames_driven(self, k: int, frames: Iterable[int]) -> int:
-        """Return the number of frames since the last of some frames before frame k in its grasp, or since it began."""
+    def steps(self, k: int, frames: Iterable[int]) -> tuple[int, ...]:
+        """Return the steps from one frame of a grasp to the next, from the last of some frames before k, or rest, to k.
+
+        Each is a number of frames of the recording.
+        """
         before, timed = self.before(k, frames), self.history.frames
         if before is not None:
-            return timed[k].index - timed[before].index
-        return timed[k].index - min(one.index for one in timed if one.grasp == timed[k].grasp) + 1
+            return (1,) * (timed[k].index - timed[before].index)
+        first = min(one.index for one in timed if one.grasp == timed[k].grasp)
+        return (max(first, 1),) + (1,) * (timed[k].index - max(first, 1))
 
     def persistence(self, k: int, frames: Iterable[int]) -> Persistence:
         """Return how the errors of frame k follow those of some frames before it."""
         frames = list(frames)
         since = self.frames_since(k, self.last_seen(k, frames))
-        return Persistence.of(
-            self.scales.autocorrelation, self.scales.noise or 1.0, since, self.frames_driven(k, frames)
-        )
+        return Persistence.of(self.scales.autocorrelation, self.scales.noise or 1.0, since, self.steps(k, frames))
 
     @classmethod
     def build(cls, dataset: Dataset, library: tuple[Effect, ...]) -> "Problem":

@@ -121,10 +121,14 @@ def _score(
     unit, scaled = own.precision * np.outer(sd, sd), own.shift * sd
     lower = problem.lower_bounds(mine)[0]
     step, evidence = step_and_evidence(own, at, sd, lower)
+    absent = np.zeros(len(mine))
     if (nuisance := np.isin(problem.own, mine)).any():
-        evidence -= step_and_evidence(own, at, problem.own_sd[nuisance], lower)[1]
+        absent = problem.own_sd[nuisance]
+        evidence -= step_and_evidence(own, at, absent, lower)[1]
     regularisation = SINGULAR * max(float(np.trace(unit)), MIN_TRACE)
-    statistic = float(scaled @ np.linalg.solve(unit + regularisation * eye, scaled))
+    covariance = np.linalg.inv(unit + regularisation * eye)
+    best = at / sd + covariance @ scaled
+    statistic = float(best @ np.linalg.solve(covariance + np.diag((absent / sd) ** 2), best))
     raw = whole[np.ix_(mine, mine)] * np.outer(sd, sd)
     kept = np.linalg.eigvals(np.linalg.solve(raw + SINGULAR * max(np.trace(raw), MIN_TRACE) * eye, unit)).real.min()
     return Score(

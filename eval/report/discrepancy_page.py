@@ -94,8 +94,8 @@ def _persistence_sentences(noise: Mapping[str, Any]) -> list[str]:
         return []
     return [
         f"Errors persist, as where a tracker drifts: what points err by has a correlation of "
-        f"{noise['autocorrelation']:.2g} from one frame to the next, changes by {1e3 * noise['step_sd_m']:.2g} mm a "
-        f"step and is some {1e3 * noise['whole_sd_m']:.2g} mm by the last one."
+        f"{noise['autocorrelation']:.2g} from one frame to the next, some {1e3 * noise['step_sd_m']:.2g} mm of it are "
+        f"new in each, and it is some {1e3 * noise['whole_sd_m']:.2g} mm by the last one."
     ]
 
 

@@ -100,6 +100,7 @@ def test_errors_that_were_seen_persist(shared):
     assert alone.rms > 1.5 * still.rms
     assert on.rms < 0.5 * (still.rms + alone.rms)
     assert on.variances.others.sum() < 0.5 * still.variances.others.sum()
+    assert on.variances.fit.sum() < 0.5 * alone.variances.fit.sum()
 
 
 def test_what_the_fit_leaves_open_of_the_last_frame_is_known_by_its_error(light, monkeypatch):

@@ -2,16 +2,19 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jiggle_mj.estimator.attribution.every_frame import following, misfit_under, weighted_together
-from jiggle_mj.estimator.attribution.fit import kept_frames
+from jiggle_mj.estimator.attribution.fit import weighed_without
+from jiggle_mj.estimator.attribution.frame_likelihood import seen_noise
 from jiggle_mj.estimator.attribution.gauss_newton import Weighed, evaluated, linearise_at, start, weigh
 from jiggle_mj.estimator.attribution.likeliest_noise import grasps_of, likeliest_noise
 from jiggle_mj.estimator.attribution.linear import SheetResiduals
+from jiggle_mj.estimator.attribution.noise_scales import NoiseScales
 from jiggle_mj.estimator.attribution.persistence import carried, drive
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.blas import one_thread
@@ -89,14 +92,14 @@ def test_the_likelihood_is_that_of_the_dense_covariance_of_all_frames(grasp, aut
     stacked = np.array([np.where(seen, errors[k].ravel(), 0.0) @ slope.T for k in frames])
     squared = np.einsum("ka,kl,lb,ab->", stacked, inverse, stacked, white)
     innovations = np.linalg.solve(share, stacked) / np.sqrt(np.diagonal(new))[:, None]
-    driven = np.array([drive(autocorrelation, problem.frames_driven(k, frames)) for k in frames])
+    driven = np.array([drive(autocorrelation, problem.steps(k, frames)) for k in frames])
     of_fields = driven @ innovations @ white @ fields
     precision = np.sum(driven**2) * fields.T @ white @ fields + np.eye(fields.shape[1]) / problem.amplitude**2
     misfit = squared - of_fields @ np.linalg.solve(precision, of_fields)
     assert found[0] - found[1] == pytest.approx(-0.5 * (1 - 0.25) * misfit, rel=1e-6)
 
 
-@pytest.mark.parametrize("autocorrelation", [0.0, 0.6, 0.95])
+@pytest.mark.parametrize("autocorrelation", [0.0, 0.25, 0.7, 0.95])
 def test_the_likeliest_autocorrelation_is_that_of_what_was_drawn(grasp, autocorrelation):
     errors, _ = drawn(grasp, autocorrelation, 1)
     with jax.enable_x64(True), one_thread():
@@ -174,14 +177,47 @@ def test_the_likeliest_noise_is_evaluated_as_the_likelihood_is(grasp):
     assert np.ptp(found) < 1e-6
 
 
+@pytest.mark.parametrize("smooth", [0.2, 1.0, 30.0])
+def test_the_likeliest_noise_has_the_largest_posterior(grasp, smooth):
+    """Of errors along few smooth fields, of a size and an autocorrelation, against others near it."""
+    fitted, problem, frames = grasp
+    rng = np.random.default_rng(3)
+    noise = 2e-4 * smooth_modes(np.asarray(problem.history.rest), 0.03, 4)
+    problem = replace(problem, assumed_noise=noise)
+    timed, a = list(problem.history.frames), np.zeros(noise.shape[1] * 3)
+    for k in frames:
+        a = 0.8 * a + 0.6 * smooth**0.5 * rng.normal(size=a.shape)
+        there = timed[k].frame
+        shown = eqx.tree_at(lambda f: f.y, there, there.y + seen_noise(there, jnp.asarray(noise)) @ a)
+        timed[k] = replace(timed[k], frame=shown)
+    problem = replace(problem, history=FrameHistory(timed, np.asarray(problem.history.rest)))
+    with jax.enable_x64(True), one_thread():
+
+        def weighed_by(scales: NoiseScales) -> Weighed:
+            return weigh(problem.with_scales(scales), fitted.point, frames)
+
+        def log_posterior(scales: NoiseScales) -> float:
+            return weighed_by(scales).log_likelihood + scales.log_prior()
+
+        at = weighed_by(replace(problem.scales, autocorrelation=0.5, smooth=1.0))
+        found = likeliest_noise(at.problem, at.weights, at.residuals)
+        best, rest = log_posterior(found), 1 - found.autocorrelation
+        others = [replace(found, smooth=found.smooth * change) for change in (0.6, 1.6)]
+        others += [replace(found, autocorrelation=1 - rest * change) for change in (0.6, 1.6) if rest * change <= 1]
+        assert max(map(log_posterior, others)) < best
+    assert found.smooth != 1.0
+
+
 @pytest.mark.parametrize(("autocorrelation", "frames"), [(0.0, 3), (0.7, 1), (0.7, 4), (0.999, 9)])
 def test_what_drives_all_frames_alike_adds_up(autocorrelation, frames):
-    """Frame by frame: in units of the sd of what is new after all of them."""
-    error, variance = 0.0, 0.0
-    for _ in range(frames):
-        error = autocorrelation * error + np.sqrt(1 - autocorrelation**2)
-        variance = autocorrelation**2 * variance + 1 - autocorrelation**2
-    assert drive(autocorrelation, frames) == pytest.approx(error / np.sqrt(variance), rel=1e-12)
+    """As a sum over frames that follow at once, and for a grasp that begins some frames after rest."""
+    powers = autocorrelation ** np.arange(frames, dtype=float)
+    alike = drive(autocorrelation, (1,) * frames)
+    assert alike == pytest.approx(powers.sum() / np.sqrt(np.sum(powers**2)), rel=1e-12)
+    first, each = (np.sqrt(1 - autocorrelation ** (2 * steps)) for steps in (24, 1))
+    last = 1 - autocorrelation ** (2 * (23 + frames))
+    expected = (powers[-1] * first + each * powers[:-1].sum()) / np.sqrt(last)
+    assert drive(autocorrelation, (24,) + (1,) * (frames - 1)) == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_fold_is_weighed_as_if_its_frames_had_never_been(grasp):
@@ -193,9 +229,8 @@ def test_a_fold_is_weighed_as_if_its_frames_had_never_been(grasp):
     kept = [frames[0], *frames[2:]]
     with jax.enable_x64(True), one_thread():
         whole = linearise_at(problem, fitted.named, fitted.point, frames)
-        stepped = replace(whole, point=fitted.point)
-        alone = linearise_at(problem, fitted.named, fitted.point, kept)
-        found, expected = kept_frames(stepped, 99), alone
+        expected = linearise_at(problem, fitted.named, fitted.point, kept)
+        found = weighed_without(whole, 99)
     assert list(found.weights) == kept
     assert found.log_likelihood == pytest.approx(expected.log_likelihood, rel=1e-9)
     np.testing.assert_allclose(found.square, expected.square, rtol=1e-6, atol=1e-6 * np.abs(expected.square).max())
