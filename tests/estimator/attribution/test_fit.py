@@ -128,7 +128,7 @@ def test_a_fit_without_a_part_uses_the_other_frames_alone(light):
 
 @pytest.mark.parametrize(("sd", "lower"), [(0.05, -np.inf), (0.4, -np.inf), (0.4, 0.1)])
 def test_the_evidence_of_a_step_is_the_integral_over_the_prior(sd, lower):
-    """Of a likelihood that is normal about 0.176, linearised at 0.14; by a sum over many values."""
+    """The likelihood is normal about 0.176 and linearised at 0.14; the integral is a sum over many values."""
     own = GaussianInformation(precision=np.array([[1600.0]]), shift=np.array([57.6]))
     step, evidence = step_and_evidence(own, np.array([0.14]), np.array([sd]), lower)
     theta = np.linspace(-1.5, 1.5, 300_001)

@@ -179,7 +179,7 @@ def test_the_likeliest_noise_is_evaluated_as_the_likelihood_is(grasp):
 
 @pytest.mark.parametrize("smooth", [0.2, 1.0, 30.0])
 def test_the_likeliest_noise_has_the_largest_posterior(grasp, smooth):
-    """Of errors along few smooth fields, of a size and an autocorrelation, against others near it."""
+    """Errors lie along few smooth fields and persist; other sizes and autocorrelations near it are less likely."""
     fitted, problem, frames = grasp
     rng = np.random.default_rng(3)
     noise = 2e-4 * smooth_modes(np.asarray(problem.history.rest), 0.03, 4)
