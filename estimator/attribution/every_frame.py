@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -78,7 +77,7 @@ def linearised(
     moved = {k: found.sheet for k, found in columns.items()}
 
     def equations(k: int) -> NormalEquations:
-        before = carried(problem.last_seen(k, weights), moved, jax.tree.map(jnp.zeros_like, moved[k]))
+        before = carried(problem.last_seen(k, weights), moved, moved[k])
         return normal_equations(weights[k], columns[k], before, residuals[k])
 
     return parallel_map(equations, weights)
@@ -116,7 +115,7 @@ def weighted_together(
     sheets = {k: found.sheet for k, found in every.items()}
 
     def one(k: int) -> WeightedResiduals:
-        before = carried(problem.last_seen(k, weights), sheets, jax.tree.map(jnp.zeros_like, sheets[k]))
+        before = carried(problem.last_seen(k, weights), sheets, sheets[k])
         return weighted_residuals(weights[k], every[k], before)
 
     return parallel_map(one, weights)

@@ -116,7 +116,7 @@ def predict_held_out(fitted: Fitted, part: int, *, persistent: bool = True) -> H
 
     def residual(k: int) -> Float[np.ndarray, "m 3"]:
         rho = np.asarray(problem.persistence(k, known_errors).autocorrelation)
-        found = error[k] - rho[:, None] * np.asarray(carried(last[k], error, np.zeros_like(error[k])))
+        found = error[k] - rho[:, None] * np.asarray(carried(last[k], error, error[k]))
         return found[closed[k].counted]
 
     def variances() -> Variances:
@@ -144,12 +144,6 @@ def noise_variance(problem: Problem, frame: ClosedFrame) -> Float[np.ndarray, " 
 def white_variance(frame: ClosedFrame) -> Float[np.ndarray, " n"]:
     """Return the variance of a coordinate of each particle by the white noise of observed positions [m^2]."""
     return 1 / np.maximum(np.asarray(frame.precision)[:, 0, 0], 1.0)
-
-
-def residuals(problem: Problem, point: Point, frames: list[int]) -> Float[np.ndarray, "m 3"]:
-    """Return observed minus predicted positions of some frames, for observed particles that are not held [m]."""
-    closed = [(problem.history.frames[k].frame, point.seen[k]) for k in frames]
-    return np.concatenate([(np.asarray(frame.y) - seen)[np.asarray(frame.counted)] for frame, seen in closed])
 
 
 def rms(residual: Float[np.ndarray, "m 3"]) -> float:
@@ -209,7 +203,7 @@ def _variances(
     by_force, by_fit = responses(fitted, predicted, likelihood, k)
     by_fit = _of_particles(by_fit)
     rho, new = (np.asarray(one) for one in (likelihood.persistence.autocorrelation, likelihood.persistence.new))
-    by_fit = by_fit - rho[:, None, None] * np.asarray(carried(last, by_fit_before, np.zeros_like(by_fit)))
+    by_fit = by_fit - rho[:, None, None] * np.asarray(carried(last, by_fit_before, by_fit))
     error = np.asarray(problem.sheet.balance.error(jnp.asarray(predicted.states[k])))
     fields = np.einsum("ani,nij->aj", by_force, np.asarray(likelihood.fields)) * problem.amplitude
     wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2)) + np.sum(fields**2, axis=1)

@@ -13,15 +13,13 @@ of a frame by c f standard deviations of what is new since the last frame that i
     d <- rho^t d + sqrt(1 - rho^2t),   q <- rho^2t q + 1 - rho^2t,   f = d / sqrt(q).
 """
 
-from typing import TypeVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-T = TypeVar("T")
+from ..parallel_map import T
 
 
 class Persistence(eqx.Module):
@@ -73,15 +71,15 @@ def drive(autocorrelation: float, steps: tuple[int, ...]) -> float:
     return driven / variance**0.5
 
 
-def carried(last: Int[np.ndarray, " n"], every: dict[int, T], nothing: T) -> T:
-    """Return the rows that each particle has in its last frame, of arrays over particles.
+def carried(last: Int[np.ndarray, " n"], every: dict[int, T], like: T) -> T:
+    """Return the rows that each particle has in its last frame, of arrays over particles; 0 where there is none.
 
     Args:
         last: that frame of each particle; -1 if there is none.
         every: the arrays of each frame, of any structure.
-        nothing: rows of particles without such a frame.
+        like: arrays of the same structure and shapes.
     """
-    found = nothing
+    found = jax.tree.map(jnp.zeros_like, like)
     for k in np.unique(last[last >= 0]):
         rows = jnp.asarray(last == k)
 

@@ -88,18 +88,17 @@ class Problem:
         """Return the fields of the smooth noise of observed positions [m]."""
         return self.assumed_noise * self.scales.smooth**0.5
 
-    def before(self, k: int, frames: Iterable[int]) -> int | None:
-        """Return the last of some frames that is before frame k in its grasp; None if there is none."""
+    def earlier(self, k: int, frames: Iterable[int]) -> list[int]:
+        """Return those of some frames that are before frame k in its grasp, the last one first."""
         grasp = self.history.frames[k].grasp
-        return max((j for j in frames if j < k and self.history.frames[j].grasp == grasp), default=None)
+        return sorted((j for j in frames if j < k and self.history.frames[j].grasp == grasp), reverse=True)
 
     def last_seen(self, k: int, frames: Iterable[int]) -> Int[np.ndarray, " n"]:
         """Return the last of some frames before frame k in its grasp that observed each particle; -1 if none did.
 
         For particles that frame k does not observe itself, it is the last of those frames.
         """
-        timed = self.history.frames
-        earlier = sorted((j for j in frames if j < k and timed[j].grasp == timed[k].grasp), reverse=True)
+        timed, earlier = self.history.frames, self.earlier(k, frames)
         last = np.where(timed[k].counted, -1, earlier[0] if earlier else -1)
         for j in earlier:
             last = np.where((last < 0) & timed[j].counted, j, last)
@@ -117,9 +116,9 @@ class Problem:
 
         Each is a number of frames of the recording.
         """
-        before, timed = self.before(k, frames), self.history.frames
-        if before is not None:
-            return (1,) * (timed[k].index - timed[before].index)
+        timed, earlier = self.history.frames, self.earlier(k, frames)
+        if earlier:
+            return (1,) * (timed[k].index - timed[earlier[0]].index)
         first = min(one.index for one in timed if one.grasp == timed[k].grasp)
         return (max(first, 1),) + (1,) * (timed[k].index - max(first, 1))
 

@@ -144,7 +144,7 @@ def test_errors_of_particles_that_disappear_follow_the_last_ones_that_were_seen(
     for k, there in zip(frames, counted, strict=True):
         persistence = problem.persistence(k, frames)
         every = {j: jnp.asarray(error) for j, error in errors.items()}
-        last = carried(problem.last_seen(k, frames), every, jnp.zeros((len(there), 3)))
+        last = carried(problem.last_seen(k, frames), every, every[k])
         new = np.asarray(persistence.innovation(jnp.asarray(errors[k]), last))[there]
         found += float(np.sum(new**2) + 3 * np.log(np.asarray(persistence.new)[there]).sum())
     for i in range(counted.shape[1]):
