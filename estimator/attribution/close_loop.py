@@ -105,7 +105,7 @@ def close_the_loop(
     if spare is not None:
         predicted = [predict_held_out(one.fitted, spare) for one in path]
     forces = [] if spare is None else [held_out_force_rms(one.fitted, spare) for one in path]
-    path, predicted, dropped = carried_over(path, predicted, forces)
+    path, predicted, dropped = upheld(path, predicted, forces)
     for name, why in dropped.items():
         log(f"{name} taken out again: {why}")
     last = path[-1]
@@ -132,28 +132,38 @@ def close_the_loop(
     )
 
 
-def carried_over(
+def upheld(
     path: list[Hypothesis], predicted: list[HeldOut], forces: Sequence[float | None] = ()
 ) -> tuple[list[Hypothesis], list[HeldOut], dict[str, str]]:
-    """Return the path up to the last hypothesis that predicts a part no worse than those before, and what is taken out.
+    """Return the path up to the last hypothesis that is upheld, and what is taken out.
+
+    It predicts a part that chose no effect no worse than those before, and no parameter is as large as it may be: the
+    size of an effect with one is unknown, and it may stand for something else.
 
     Args:
         path: hypotheses, each with one effect more.
         predicted: prediction of the part by each; empty if there is no such part.
         forces: error of the tool's force in the part by each [N]. It decides for effects that show in nothing else.
     """
-    if not predicted:
-        return path, predicted, {}
-    rms = [one.rms for one in predicted]
-    last = max(k for k in range(len(path)) if _carries_over(path, rms, forces, k))
-    errors = f"{1e3 * rms[-1]:.2f} mm with it and {1e3 * rms[last]:.2f} mm without"
-    why = f"it did not carry over: the part that chose no effect is predicted to {errors}"
-    dropped = {name: why for name in path[-1].names if name not in path[last].names}
+    rms, whole = [one.rms for one in predicted], path[-1]
+    last = max(k for k, one in enumerate(path) if not one.at_bound and _carries_over(path, rms, forces, k))
+
+    def why(name: str) -> str:
+        if name in whole.at_bound:
+            return "its size is as large as it may be, so that there is more of it, or something else"
+        if _carries_over(path, rms, forces, len(path) - 1):
+            return f"it is found beside {' and '.join(whole.at_bound)}, of the largest size that may be"
+        errors = f"{1e3 * rms[-1]:.2f} mm with it and {1e3 * rms[last]:.2f} mm without"
+        return f"it did not carry over: the part that chose no effect is predicted to {errors}"
+
+    dropped = {name: why(name) for name in whole.names if name not in path[last].names}
     return path[: last + 1], predicted[: last + 1], dropped
 
 
 def _carries_over(path: list[Hypothesis], rms: list[float], forces: Sequence[float | None], k: int) -> bool:
-    """Return whether hypothesis k of a path predicts a part no worse than those before."""
+    """Return whether hypothesis k of a path predicts a part no worse than those before; True if there is no part."""
+    if not rms:
+        return True
     if path[k].added and path[k].added[-1].effect.needs_force:
         error, before = forces[k], forces[k - 1]
         worse = error is not None and before is not None and error > before

@@ -14,7 +14,7 @@ from ..effects import Effect
 from ..parallel_map import parallel_map
 from .evidence import log_model_evidence
 from .fit import Fits, fit, fit_to_more, without
-from .gauss_newton import Fitted, linearise_at, moved
+from .gauss_newton import MAX_EFFECT, Fitted, linearise_at, moved
 from .problem import Problem
 from .scores import MIN_SCORE, Score, scores
 from .starts import ObservedStates, stepped
@@ -31,6 +31,8 @@ N_SEARCHED = 12
 """Number of frames that the search is over, where there are more: the frames of a pull tell much the same."""
 MAX_SEARCHED = 16
 """Number of frames up to which it is over all of them, as fits to a few more afterwards would cost more."""
+ROUNDING = 1e-9
+"""Relative rounding of a parameter that is at its bound."""
 Log = Callable[[str], None]
 """Receiver of progress messages."""
 
@@ -87,6 +89,12 @@ class Hypothesis:
     def theta(self, one: AddedEffect) -> np.ndarray:
         """Return the parameters of one of its effects."""
         return self.fitted.point.theta[one.at]
+
+    @property
+    def at_bound(self) -> tuple[str, ...]:
+        """Return the names of the effects that have a parameter of the largest size that it may have."""
+        largest = MAX_EFFECT * (1 - ROUNDING) * self.fitted.problem.prior_sd
+        return tuple(one.effect.name for one in self.added if (np.abs(self.theta(one)) >= largest[one.at]).any())
 
     @property
     def path(self) -> "list[Hypothesis]":

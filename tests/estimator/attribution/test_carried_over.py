@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jiggle_mj.errors import RecordingError
-from jiggle_mj.estimator.attribution.close_loop import Closed, carried_over, check_finite, jackknife_sd
+from jiggle_mj.estimator.attribution.close_loop import Closed, check_finite, jackknife_sd, upheld
 from jiggle_mj.estimator.attribution.discrepancy import refused, reported_sd
 from jiggle_mj.estimator.attribution.held_out import HeldOut, Variances
 from jiggle_mj.estimator.attribution.hypotheses import Hypothesis
@@ -53,20 +53,44 @@ def test_effects_that_predict_the_reported_part_worse_are_taken_out_again():
     """Two effects: the first improves the part that chose none from 4.8 to 4.0 mm, the second makes it 6.6 mm."""
     path = hypothesis("gravity", "bed").path
     assert [one.names for one in path] == [(), ("gravity",), ("gravity", "bed")]
-    kept, predicted, dropped = carried_over(path, held_out(4.8, 4.0, 6.6))
+    kept, predicted, dropped = upheld(path, held_out(4.8, 4.0, 6.6))
     assert kept == path[:2] and [1e3 * one.rms for one in predicted] == pytest.approx([4.8, 4.0])
     assert list(dropped) == ["bed"]
     assert dropped["bed"].endswith("predicted to 6.60 mm with it and 4.00 mm without")
-    assert carried_over(path, held_out(4.8, 4.0, 4.1))[0] == path[:2]
-    assert carried_over(path, held_out(4.8, 4.9, 6.6))[0] == path[:1]
-    assert carried_over(path, held_out(4.8, 4.9, 4.7)) == (path, ANY, {})
-    assert carried_over(path, []) == (path, [], {})
+    assert upheld(path, held_out(4.8, 4.0, 4.1))[0] == path[:2]
+    assert upheld(path, held_out(4.8, 4.9, 6.6))[0] == path[:1]
+    assert upheld(path, held_out(4.8, 4.9, 4.7)) == (path, ANY, {})
+    assert upheld(path, []) == (path, [], {})
+
+
+def test_an_effect_whose_size_is_as_large_as_it_may_be_is_taken_out_with_what_is_found_beside_it():
+    """Both predict the reported part better; the size of the second one is at its bound of four prior sd."""
+    path = hypothesis("gravity", "bed").path
+    assert [one.at_bound for one in path] == [(), (), ()]
+    path[2] = at_bound(path[2], "bed")
+    kept, _, dropped = upheld(path, held_out(4.8, 4.0, 3.0))
+    assert kept == path[:2] and list(dropped) == ["bed"] and "as large as it may be" in dropped["bed"]
+    assert upheld(path, [])[0] == path[:2]
+    path[1] = at_bound(path[1], "gravity")
+    kept, _, dropped = upheld(path, held_out(4.8, 4.0, 3.0))
+    assert kept == path[:1] and dropped["gravity"] == "it is found beside bed, of the largest size that may be"
+
+
+def at_bound(one: Hypothesis, name: str) -> Hypothesis:
+    """Return a hypothesis with an effect that alone has a parameter at its bound."""
+    fitted = one.fitted
+    at = np.array([1])
+    theta = np.zeros(len(fitted.problem.prior_sd))
+    theta[at] = -4 * fitted.problem.prior_sd[at]
+    there = replace(fitted, point=replace(fitted.point, theta=theta))
+    added = tuple(replace(each, at=at if each.effect.name == name else np.array([0])) for each in one.added)
+    return replace(one, added=added, fits=one.fits._replace(likeliest=there))
 
 
 def test_the_force_decides_whether_its_scale_carries_over():
     path = hypothesis("force_scale").path
-    assert carried_over(path, held_out(4.8, 4.9), [0.02, 0.01])[0] == path
-    assert carried_over(path, held_out(4.8, 4.7), [0.02, 0.03])[0] == path[:1]
+    assert upheld(path, held_out(4.8, 4.9), [0.02, 0.01])[0] == path
+    assert upheld(path, held_out(4.8, 4.7), [0.02, 0.03])[0] == path[:1]
 
 
 def test_each_effect_that_was_fitted_and_is_not_named_has_a_reason():
