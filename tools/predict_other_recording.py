@@ -12,9 +12,10 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jiggle_mj.estimator.attribution.dataset import collect_dataset
-from jiggle_mj.estimator.attribution.held_out import from_rest, residuals, rms
+from jiggle_mj.estimator.attribution.held_out import from_rest, rms
 from jiggle_mj.estimator.attribution.problem import Point, Problem
 from jiggle_mj.estimator.effects import LIBRARY
 from jiggle_mj.eval.metrics.result_file import read_json
@@ -53,6 +54,12 @@ def _error_by_grasp(problem: Problem, effects: list[dict[str, Any]]) -> str:
     errors = [residuals(problem, held_out, grasp) for grasp in grasps]
     by_grasp = ", ".join(f"{1e3 * rms(error):.1f}" for error in errors)
     return f"{1e3 * rms(np.concatenate(errors)):.1f} mm; by grasp {by_grasp}"
+
+
+def residuals(problem: Problem, point: Point, frames: list[int]) -> Float[np.ndarray, "m 3"]:
+    """Return observed minus predicted positions of some frames, for observed particles that are not held [m]."""
+    closed = [(problem.history.frames[k].frame, point.seen[k]) for k in frames]
+    return np.concatenate([(np.asarray(frame.y) - seen)[np.asarray(frame.counted)] for frame, seen in closed])
 
 
 if __name__ == "__main__":
