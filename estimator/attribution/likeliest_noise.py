@@ -67,13 +67,14 @@ class GraspProducts(NamedTuple):
         """
         values = factor * self.values
         scaled = np.sqrt(factor / (1 + values))[:, :, None] * self.along
-        left = self.under - np.einsum("tck,tcl->tkl", scaled, scaled)
+        left = self.under - scaled.swapaxes(1, 2) @ scaled
         rho = autocorrelation**self.since
         by = np.concatenate([np.ones_like(rho), -rho], axis=1) / np.tile(np.sqrt(1 - rho**2), 2)
         driven = np.array([drive(autocorrelation, steps) for steps in self.steps])
-        squared = float(np.einsum("ta,tab,tb->", by, left[:, N_FIELDS:, N_FIELDS:], by))
-        of_fields = np.einsum("t,tqa,ta->q", driven, left[:, :N_FIELDS, N_FIELDS:], by)
-        among = np.einsum("t,tqr->qr", driven**2, left[:, :N_FIELDS, :N_FIELDS])
+        of_forces = (left[:, :, N_FIELDS:] @ by[:, :, None])[:, :, 0]
+        squared = float(np.sum(by * of_forces[:, N_FIELDS:]))
+        of_fields = driven @ of_forces[:, :N_FIELDS]
+        among = np.tensordot(driven**2, left[:, :N_FIELDS, :N_FIELDS], axes=1)
         precision = among + np.eye(N_FIELDS) / amplitude**2
         squared -= float(of_fields @ np.linalg.solve(precision, of_fields))
         log_det = float(np.sum(np.log1p(values)) + np.linalg.slogdet(amplitude**2 * precision)[1])
