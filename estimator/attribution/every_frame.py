@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from ..effects.sheet_model import FrameContext
 from ..parallel_map import T, parallel_map
+from .bed_contact import contact_share
 from .frame_likelihood import FrameLikelihood, frame_likelihood, with_noise
 from .grasped_frames import ClosedFrame
 from .linear import (
@@ -47,10 +48,12 @@ def weighed(
         among: the frames whose errors theirs may follow; the frames themselves if None.
     """
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
+    assumed, assumed_noise = problem.with_scales(problem.assumed_scales).sheet, jnp.asarray(problem.assumed_noise)
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameLikelihood:
         persistence = problem.persistence(k, frames if among is None else among)
-        return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise, persistence)
+        contact = contact_share(assumed, theta, frame, context, x, assumed_noise)  # the same for all noise scales
+        return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise, persistence, contact)
 
     return each_frame(problem, point, frames, one)
 

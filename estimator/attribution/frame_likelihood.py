@@ -36,6 +36,7 @@ from ..filters.frame import Frame
 from ..filters.smooth_noise import each
 from ..physics.block_tridiagonal import BlockCholesky, log_det, normal_cholesky
 from ..physics.membrane import TriangleMembrane
+from .bed_contact import left_out_contact, with_contact
 from .grasped_frames import ClosedFrame
 from .persistence import Persistence
 from .sheet import PredictedSheet, mean_of_held
@@ -72,6 +73,8 @@ class FrameLikelihood(eqx.Module):
     """ln |H^T H| over the particles with a force equation."""
     persistence: Persistence
     """How its errors follow those of the frames before."""
+    contact: Float[Array, " n"]
+    """Share of the bed's contact with each particle that counts; see `bed_contact`."""
     adjoint: Float[Array, "n 3 3"] | None = None
     """By how much the tool's force falls with a force on each particle [1]; None where no frame has a measured one."""
 
@@ -141,14 +144,17 @@ def frame_likelihood(
     x: Float[Array, "n 3"],
     noise: Float[Array, "n modes"],
     persistence: Persistence,
+    contact: Float[Array, " n"],
 ) -> FrameLikelihood:
     """Return a frame's likelihood at its predicted state x; `noise` are the smooth noise's fields [m].
+
+    `contact` is the share of the bed's contact that counts; see `bed_contact`.
 
     It is two programs, like `normal_equations`: as one, XLA lays the factor out so that a solve takes 1.5 times as
     long.
     """
-    balance, linear, fields = around(sheet, theta, s, frame, context, x)
-    likelihood = _likelihood(balance, linear, persistence.drive * fields, frame, noise, persistence)
+    balance, linear, fields = around(sheet, theta, s, frame, context, x, contact)
+    likelihood = _likelihood(balance, linear, persistence.drive * fields, frame, noise, persistence, contact)
     likelihood = replace(likelihood, log_square=_log_square(likelihood))
     if frame.pull is None:
         return likelihood
@@ -159,7 +165,7 @@ def with_force_sd(
     likelihood: FrameLikelihood, force_sd: Float[Array, ""], frame: ClosedFrame, noise: Float[Array, "n modes"]
 ) -> FrameLikelihood:
     """Return a frame's likelihood with another standard deviation of force errors, the field of `ForceBalance` [N]."""
-    found = _likelihood(*_with_force_sd(likelihood, force_sd), frame, noise, likelihood.persistence)
+    found = _likelihood(*_with_force_sd(likelihood, force_sd), frame, noise, likelihood.persistence, likelihood.contact)
     return replace(found, log_square=likelihood.log_square, adjoint=likelihood.adjoint)
 
 
@@ -200,9 +206,10 @@ def around(
     frame: ClosedFrame,
     context: FrameContext,
     x: Float[Array, "n 3"],
+    contact: Float[Array, " n"],
 ) -> tuple[ForceBalance, Frame, Float[Array, "n 3 q"]]:
-    """Return the force balance, its linearisation at x, and Q."""
-    model = sheet.model(theta, context, frame.displacement)
+    """Return the force balance with a share of the bed's contact, its linearisation at x, and Q."""
+    model = with_contact(sheet.model(theta, context, frame.displacement), contact)
     balance = sheet.balance.with_energy(model.energy)
     precision = jnp.where(frame.held[:, None, None], HELD_STATE_PRECISION * jnp.eye(3)[None], frame.precision)
     linear = balance.linearise(
@@ -219,6 +226,7 @@ def _likelihood(
     frame: ClosedFrame,
     noise: Float[Array, "n modes"],
     persistence: Persistence,
+    contact: Float[Array, " n"],
 ) -> FrameLikelihood:
     smooth = each(partial(balance.apply, linear.dr_dx), seen_noise(frame, noise))
     white = each(partial(balance.whitened, linear), smooth)
@@ -233,6 +241,7 @@ def _likelihood(
         among=jnp.zeros((N_FIELDS, N_FIELDS)),
         log_square=jnp.zeros(()),
         persistence=persistence,
+        contact=contact,
     )
     return replace(likelihood, among=likelihood.dot(fields, fields, likelihood.white))
 
@@ -252,7 +261,8 @@ def _pull_adjoint(
 ) -> Float[Array, "n 3 3"]:
     balance, linear = likelihood.balance, likelihood.frame
     model = sheet.model(theta, context, frame.displacement)
-    return adjoint(balance, linear, pull_slope(balance, model, frame, linear.s, linear.x))
+    left_out = left_out_contact(model, linear.x, likelihood.contact)
+    return adjoint(balance, linear, pull_slope(balance, model, frame, linear.s, linear.x), left_out)
 
 
 def seen_noise(frame: ClosedFrame, noise: Float[Array, "n modes"]) -> Float[Array, "n 3 k"]:

@@ -34,6 +34,7 @@ from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
 from ..parallel_map import parallel_map
 from ..physics.block_tridiagonal import inverse_band, window_sums
+from .bed_contact import left_out_contact
 from .every_frame import each_frame
 from .frame_errors import CommonAmplitudes, ForceErrors, common_amplitudes, frame_errors
 from .frame_likelihood import FrameLikelihood, around, seen_noise
@@ -133,7 +134,7 @@ def frame_slope(
     of_square = inverse_band(likelihood.square_factor())
 
     def expected(theta: Float[Array, " p"], s: Float[Array, " n"], x: Float[Array, "n 3"]):
-        balance, linear, Q = around(sheet, theta, s, frame, context, x)
+        balance, linear, Q = around(sheet, theta, s, frame, context, x, likelihood.contact)
         model = sheet.model(theta, context, frame.displacement)
         e = likelihood.seen[:, None] * (frame.y - look(model, x))
         new, unbalanced = map(persistence.innovation, (e, linear.unbalanced), residuals.before)
@@ -147,6 +148,7 @@ def frame_slope(
         return total + jnp.sum(of_next * e), ForceErrors.of(likelihood, f, left)
 
     (along_theta, along_s, along_x), found = jax.grad(expected, argnums=(0, 1, 2), has_aux=True)(theta, s, x)
-    balance_slope = adjoint(likelihood.balance, likelihood.frame, along_x[:, :, None])[:, :, 0]
+    left_out = left_out_contact(sheet.model(theta, context, frame.displacement), x, likelihood.contact)
+    balance_slope = adjoint(likelihood.balance, likelihood.frame, along_x[:, :, None], left_out)[:, :, 0]
     of_theta, of_s = jax.vjp(lambda a, b: gripped_forces(sheet, a, b, frame, context, x), theta, s)[1](balance_slope)
     return FrameSlope(of_s=along_s - of_s, of_theta=along_theta - of_theta, force_errors=found)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from ..effects.sheet_model import FrameContext, look
 from ..filters.smooth_noise import each
+from .bed_contact import with_contact
 from .frame_likelihood import FrameLikelihood, seen_shift
 from .grasped_frames import ClosedFrame
 from .sheet import PredictedSheet, gripped_forces, tool_residual
@@ -169,7 +170,8 @@ def residuals_of(
     Forces that do not balance there count too: where a material is unstable, no equilibrium is found.
     """
     model = sheet.model(theta, context, frame.displacement)
-    unbalanced = sheet.balance.with_energy(model.energy).unbalanced(x, s)
+    energy = with_contact(model, likelihood.contact).energy
+    unbalanced = sheet.balance.with_energy(energy).unbalanced(x, s)
     positions = likelihood.seen[:, None] * (frame.y - look(model, x))
     tool = tool_residual(sheet, model, theta, frame, context, x) / tool_sd(frame)
     pull = None
@@ -209,7 +211,8 @@ def _parameter_columns(
     def along(u):
         to = theta + directions @ u
         changed = sheet.model(to, context, frame.displacement)
-        unbalanced = sheet.balance.with_energy(changed.energy).unbalanced(x, s)
+        energy = with_contact(changed, likelihood.contact).energy
+        unbalanced = sheet.balance.with_energy(energy).unbalanced(x, s)
         return unbalanced, look(changed, x), tool_residual(sheet, changed, to, frame, context, x)
 
     dforce, dview, dtool = jax.jacfwd(along)(jnp.zeros(directions.shape[1]))

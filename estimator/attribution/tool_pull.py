@@ -78,11 +78,17 @@ def predicted_pull(
     return model.force_factor * jnp.sum(jnp.where(frame.held[:, None], forces, 0.0), axis=0)
 
 
-def adjoint(balance: ForceBalance, linear: Frame, dP_dx: Float[Array, "n 3 c"]) -> Float[Array, "n 3 c"]:
-    """Return lambda at a linearised state; dP_dx has the components of P, or of anything else, last."""
+def adjoint(
+    balance: ForceBalance, linear: Frame, dP_dx: Float[Array, "n 3 c"], left_out: Float[Array, "n 3 3"]
+) -> Float[Array, "n 3 c"]:
+    """Return lambda at a linearised state; dP_dx has the components of P, or of anything else, last.
+
+    `left_out` is the stiffness under each particle that the balance leaves out and the state's equilibrium has [N/m].
+    """
     itself = balance.neighbours == jnp.arange(len(linear.x))[:, None]
-    springs = jnp.where(itself, grip_stiffness(balance, linear)[:, None], 0.0)
-    rows = linear.dr_dx + springs[:, :, None, None] * jnp.eye(3)[None, None]
+    springs = grip_stiffness(balance, linear)[:, None, None] * jnp.eye(3)[None]
+    added = springs + (1 - linear.s)[:, None, None] * left_out
+    rows = linear.dr_dx + jnp.where(itself[:, :, None, None], added[:, None], 0.0)
     n = len(linear.x)
     factor = normal_cholesky(balance.layout, balance.places, rows, jnp.ones(n), jnp.zeros((n, 3, 3)))
 

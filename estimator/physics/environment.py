@@ -60,8 +60,8 @@ class BedContact(Term):
     """Height at which each particle touches the bed [m]."""
     up: Float[Array, " 3"]
     """Unit vector against gravity."""
-    stiffness: Float[Array, ""]
-    """Stiffness of the bed under one particle [N/m]."""
+    stiffness: Float[Array, ""] | Float[Array, " n"]
+    """Stiffness of the bed under each particle [N/m]; one number if it is the same."""
 
     @classmethod
     def build(
@@ -97,7 +97,7 @@ class BedContact(Term):
 
     def gradient(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3"]:
         """Return the derivative of each element's energy [N]."""
-        return self.stiffness * jnp.outer(self._depth(x), self.up)[:, None]
+        return jnp.outer(self.stiffness * self._depth(x), self.up)[:, None]
 
     def hessian(self, x: Float[Array, "n 1 3"]) -> Float[Array, "n 1 3 1 3"]:
         """Return the bed's stiffness for particles in contact [N/m]."""

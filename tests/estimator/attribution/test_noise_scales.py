@@ -86,7 +86,8 @@ def test_a_likelihood_with_another_force_error_is_the_one_built_with_it(begun):
     frame, states = problem.history.frames[k].frame, jnp.asarray(point.states)
     context, theta, s = problem.history.context(k, states), jnp.asarray(point.theta), jnp.asarray(point.s)
     persistence = problem.persistence(k, list(begun.weights))
-    built = frame_likelihood(other.sheet, theta, s, frame, context, states[k], noise, persistence)
+    contact = begun.weights[k].contact
+    built = frame_likelihood(other.sheet, theta, s, frame, context, states[k], noise, persistence, contact)
     changed = with_force_sd(begun.weights[k], other.sheet.balance.force_sd, frame, noise)
     for one, two in zip(jax.tree.leaves(built), jax.tree.leaves(changed), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-7 * float(np.abs(one).max(initial=0.0)))
