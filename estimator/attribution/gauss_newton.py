@@ -16,7 +16,16 @@ from ..belief.attachment_belief import AttachmentBelief
 from ..belief.gaussian_information import GaussianInformation
 from ..filters.implicit import likeliest, quick_summary
 from ..filters.posterior_summary import PosteriorSummary
-from .every_frame import directions, in_common, linearised, log_determinants, misfit_of, residual, weighed
+from .every_frame import (
+    directions,
+    in_common,
+    linearised,
+    log_determinants,
+    misfit_of,
+    misfit_under,
+    residual,
+    weighed,
+)
 from .frame_likelihood import FrameLikelihood
 from .linear import NormalEquations, WeightedResiduals
 from .noise_scales import NoiseScales
@@ -203,24 +212,32 @@ def better_point(now: Fitted, steps: list[Step]) -> Weighed | None:
     """Return a point of lower cost; None if none is found.
 
     Whole steps are tried first, those of the largest predicted gain, then shorter ones along the first of them. The
-    posterior may have stiffnesses that fit worse; a step of the parameters alone then has the larger gain.
+    posterior may have stiffnesses that fit worse; a step of the parameters alone then has the larger gain. Where the
+    prediction does not even fit better under the weights that the step was found with, it is not weighed anew.
     """
     gains = _whole_gains(now, steps)
     whole = [steps[k] for k in np.argsort(-np.array(gains), kind="stable") if gains[k] > MIN_GAIN]
     tries = [(step, 1.0) for step in whole[:MAX_WHOLE]]
     tries += [(step, share) for step in whole[:1] for share in SHORTER_SHARES]
     for step, share in tries:
-        there = after_step(now, step, share)
-        if cost(there, now.named) < now.cost - MIN_GAIN:
-            return there
+        point = predicted_after(now, step, share)
+        if _gain_under_weights(now, point) > MIN_GAIN:
+            there = weigh(now.problem, point, list(now.equations))
+            if cost(there, now.named) < now.cost - MIN_GAIN:
+                return there
     return None
 
 
 def after_step(now: Fitted, step: Step, share: float, scales: NoiseScales | None = None) -> Weighed:
     """Return the point after a share of a step, with other noise scales if any are given."""
+    problem = now.problem if scales is None else now.problem.with_scales(scales)
+    return weigh(problem, predicted_after(now, step, share), list(now.equations))
+
+
+def predicted_after(now: Fitted, step: Step, share: float) -> Point:
+    """Return the parameters and s after a share of a step, with their predictions."""
     theta, s = applied(now, step, share)
-    problem, frames = now.problem if scales is None else now.problem.with_scales(scales), list(now.equations)
-    return weigh(problem, start(problem, theta, s, now.point.states, frames), frames)
+    return start(now.problem, theta, s, now.point.states, list(now.equations))
 
 
 def promised_log_posterior(now: Fitted) -> float:
@@ -240,6 +257,16 @@ def applied(now: Fitted, step: Step, share: float) -> Step:
     theta = now.point.theta + share * step[0]
     theta[free] = now.problem.bounded(free, theta[free], largest)
     return theta, np.clip(now.point.s + share * step[1], 0, MAX_STIFFNESS)
+
+
+def _gain_under_weights(now: Fitted, point: Point) -> float:
+    """Return by how much the cost falls to the predictions of a point, under the weights that there are [nat, doubled].
+
+    It is no number where a frame is not predicted.
+    """
+    free, sd = now.free, now.problem.sd(now.named)
+    gain = float(now.square[-1, -1]) - misfit_under(now.problem, now.weights, point)
+    return gain + _prior(now.point.theta, now.point.s, free, sd) - _prior(point.theta, point.s, free, sd)
 
 
 def _predicted_gain(now: Fitted, theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"]) -> float:
