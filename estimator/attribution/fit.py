@@ -77,11 +77,12 @@ def fit_to_more(fits: Fits, frames: list[int], before: Fits | None) -> Fits:
     """Return fits to more frames, with errors of the likeliest size.
 
     They begin where the fits ended, or at the likeliest fit to all those frames without one of the effects, if the
-    normal equations promise more there.
+    normal equations promise more there; with the scales of that fit, or without one with those of the fits.
     """
     last = fits.likeliest
-    begun = start(last.problem, last.point.theta, last.point.s, last.point.states, frames)
-    now = _with_likeliest_scales(linearise_at(last.problem, last.named, begun, frames))
+    problem = (before or fits).likeliest.problem
+    begun = start(problem, last.point.theta, last.point.s, last.point.states, frames)
+    now = linearise_at(problem, last.named, begun, frames)
     if before is not None:
         now = max(now, linearised_fit(before.likeliest, last.named), key=promised_log_posterior)
     return fits._replace(likeliest=_refined(gauss_newton(now)))
