@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
 
 from ..belief.gaussian_information import GaussianInformation
+from ..effects.frame_history import FrameHistory
 from ..parallel_map import parallel_map
 from .every_frame import directions, weighed
 from .frame_likelihood import FrameLikelihood
@@ -121,7 +122,8 @@ def predict_held_out(fitted: Fitted, part: int, *, persistent: bool = True) -> H
 
     def variances() -> Variances:
         known = _covariance(fitted)
-        weights = weighed(problem, predicted, [*lasts, *frames], among=known_errors)
+        unseen = _as_predicted(problem, predicted, [*lasts, *frames])  # the last ones too, to be compared with
+        weights = weighed(unseen, predicted, [*lasts, *frames], among=known_errors)
         by_fit = parallel_map(lambda j: _of_particles(responses(fitted, predicted, weights[j], j)[1]), lasts)
 
         def one(k: int) -> Variances:
@@ -134,6 +136,14 @@ def predict_held_out(fitted: Fitted, part: int, *, persistent: bool = True) -> H
         )
 
     return HeldOut(residual=np.concatenate([residual(k) for k in frames]), compute_variances=variances)
+
+
+def _as_predicted(problem: Problem, predicted: Point, frames: list[int]) -> Problem:
+    """Return a problem that observes some frames as predicted: intervals must not depend on what is seen there."""
+    every = list(problem.history.frames)
+    for k in frames:
+        every[k] = replace(every[k], frame=replace(every[k].frame, y=jnp.asarray(predicted.seen[k])))
+    return replace(problem, history=FrameHistory(every, np.asarray(problem.history.rest)))
 
 
 def noise_variance(problem: Problem, frame: ClosedFrame) -> Float[np.ndarray, " n"]:

@@ -63,6 +63,21 @@ def test_a_parameter_that_is_less_certain_widens_the_prediction(light):
     np.testing.assert_array_equal(vague.others, known.others)
 
 
+def test_the_intervals_do_not_depend_on_what_is_seen_in_the_frames_that_they_are_of(light):
+    """All that is not held is seen 3 mm higher there, as if nothing touched the bed."""
+    fitted = light[0].declared.fitted
+    problem, part = fitted.problem, light[2].frames[-1].part
+    frames = list(problem.history.frames)
+    for k in problem.frames({part}):
+        higher = frames[k].frame.y + jnp.where(frames[k].frame.held[:, None], 0.0, 3e-3 * jnp.eye(3)[2:])
+        frames[k] = replace(frames[k], frame=replace(frames[k].frame, y=higher))
+    seen = replace(fitted, problem=replace(problem, history=FrameHistory(frames, np.asarray(problem.history.rest))))
+    with jax.enable_x64(True), one_thread():
+        first, second = predict_held_out(fitted, part), predict_held_out(seen, part)
+        assert abs(second.rms - first.rms) > 1e-3
+        np.testing.assert_array_equal(second.sd, first.sd)
+
+
 @pytest.fixture(scope="module")
 def shared(light):
     """Return the fit of the declared model, with noise that neighbours share, and the amplitudes of an error of it."""
