@@ -264,17 +264,20 @@ def _gain_under_weights(now: Fitted, point: Point) -> float:
 
     It is no number where a frame is not predicted.
     """
-    free, sd = now.free, now.problem.sd(now.named)
-    gain = float(now.square[-1, -1]) - misfit_under(now.problem, now.weights, point)
-    return gain + _prior(now.point.theta, now.point.s, free, sd) - _prior(point.theta, point.s, free, sd)
+    return _gain(now, point.theta, point.s, misfit_under(now.problem, now.weights, point))
 
 
 def _predicted_gain(now: Fitted, theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"]) -> float:
     """Return by how much the normal equations predict that the misfit is lower there [nat, doubled]."""
-    free, sd, point = now.free, now.problem.sd(now.named), now.point
-    displacement = np.concatenate([s - point.s, (theta - point.theta)[free], [1.0]])
-    gain = float(now.square[-1, -1] - displacement @ now.square @ displacement)
-    return gain + _prior(point.theta, point.s, free, sd) - _prior(theta, s, free, sd)
+    displacement = np.concatenate([s - now.point.s, (theta - now.point.theta)[now.free], [1.0]])
+    return _gain(now, theta, s, float(displacement @ now.square @ displacement))
+
+
+def _gain(now: Fitted, theta: Float[np.ndarray, " p"], s: Float[np.ndarray, " n"], misfit: float) -> float:
+    """Return by how much the cost falls to a misfit elsewhere, with the determinants that there are [nat, doubled]."""
+    free, sd = now.free, now.problem.sd(now.named)
+    fall = float(now.square[-1, -1]) - misfit
+    return fall + _prior(now.point.theta, now.point.s, free, sd) - _prior(theta, s, free, sd)
 
 
 def candidate_steps(now: Fitted, *, likeliest_set: bool = True) -> list[Step]:
