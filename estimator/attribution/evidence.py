@@ -17,7 +17,7 @@ from .gauss_newton import Fitted
 SWEEPS = 15
 """Sweeps of expectation propagation, after which the sites have settled."""
 NEAR_BOUND = 1e-9
-"""Distance from its lower bound up to which a parameter is at it [prior standard deviations]."""
+"""Distance from its bound up to which a parameter is at it [prior standard deviations]."""
 
 
 def log_model_evidence(fitted: Fitted) -> float:

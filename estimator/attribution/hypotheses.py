@@ -12,7 +12,7 @@ import numpy as np
 
 from ..effects import Effect
 from ..parallel_map import parallel_map
-from .evidence import log_model_evidence
+from .evidence import NEAR_BOUND, log_model_evidence
 from .fit import Fits, fit, fit_to_more, without
 from .gauss_newton import MAX_EFFECT, Fitted, linearise_at, moved
 from .problem import Problem
@@ -31,8 +31,6 @@ N_SEARCHED = 12
 """Number of frames that the search is over, where there are more: the frames of a pull tell much the same."""
 MAX_SEARCHED = 16
 """Number of frames up to which it is over all of them, as fits to a few more afterwards would cost more."""
-ROUNDING = 1e-9
-"""Relative rounding of a parameter that is at its bound."""
 Log = Callable[[str], None]
 """Receiver of progress messages."""
 
@@ -93,7 +91,7 @@ class Hypothesis:
     @property
     def at_bound(self) -> tuple[str, ...]:
         """Return the names of the effects that have a parameter of the largest size that it may have."""
-        largest = MAX_EFFECT * (1 - ROUNDING) * self.fitted.problem.prior_sd
+        largest = (MAX_EFFECT - NEAR_BOUND) * self.fitted.problem.prior_sd
         return tuple(one.effect.name for one in self.added if (np.abs(self.theta(one)) >= largest[one.at]).any())
 
     @property
