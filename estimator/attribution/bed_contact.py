@@ -2,7 +2,7 @@
 
 The bed only pushes, so that a particle that touches it is held from below alone. Linearised there, the model would hold
 it from both sides: one that is predicted to touch, and observed 3 mm above, would cost as if the bed pulled at it, and
-that cost would come and go by hundreds of nat as the prediction touches the bed. Either contact is likely,
+that cost, tens of nat, would come and go as the prediction touches the bed. There either contact may be,
 
     on:  the observed height h errs by noise,            ln p = -h^2 / 2 sigma^2,
     off: the push P of the bed is an error of forces,    ln p = -P^2 / 2 tau^2 - ln(sd of a free height / sigma),
@@ -33,7 +33,7 @@ def contact_share(
     frame: ClosedFrame,
     context: FrameContext,
     x: Float[Array, "n 3"],
-    noise: Float[Array, "n modes"],
+    variance: Float[Array, " n"],
 ) -> Float[Array, " n"]:
     """Return the share of the bed's contact with each particle that counts at its predicted state; 1 without a bed.
 
@@ -43,13 +43,12 @@ def contact_share(
         frame: what was observed.
         context: what effects know of it.
         x: predicted state [m].
-        noise: fields of the smooth noise of observed positions [m].
+        variance: of a coordinate of each observed position by its noise [m^2].
     """
     model = sheet.model(theta, context, frame.displacement)
     if not model.has(BedContact):
         return jnp.ones(len(x))
     bed, balance = model.term(BedContact), sheet.balance.with_energy(model.energy)
-    variance = 1 / jnp.maximum(frame.precision[:, 0, 0], 1.0) + jnp.sum(noise**2, axis=1)
     above = jnp.maximum((frame.y - look(model, x)) @ bed.up, 0.0)
     push = bed.gradient(x[:, None])[:, 0] @ bed.up / balance.error(x)
     log_odds = LOG_FREE_SD + 0.5 * push**2 - 0.5 * above**2 / variance

@@ -48,11 +48,12 @@ def weighed(
         among: the frames whose errors theirs may follow; the frames themselves if None.
     """
     theta, s, noise = (jnp.asarray(a) for a in (point.theta, point.s, problem.noise))
-    assumed, assumed_noise = problem.with_scales(problem.assumed_scales).sheet, jnp.asarray(problem.assumed_noise)
+    assumed = problem.with_scales(problem.assumed_scales).sheet
 
     def one(k: int, frame: ClosedFrame, context: FrameContext, x: Float[Array, "n 3"]) -> FrameLikelihood:
         persistence = problem.persistence(k, frames if among is None else among)
-        contact = contact_share(assumed, theta, frame, context, x, assumed_noise)  # the same for all noise scales
+        variance = jnp.asarray(frame.noise_variance(problem.assumed_noise))
+        contact = contact_share(assumed, theta, frame, context, x, variance)  # the same for all noise scales
         return frame_likelihood(problem.sheet, theta, s, frame, context, x, noise, persistence, contact)
 
     return each_frame(problem, point, frames, one)

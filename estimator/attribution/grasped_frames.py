@@ -1,6 +1,6 @@
 """A recording's frames with closed jaws, as arrays for fits over all of them at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import equinox as eqx
@@ -53,6 +53,10 @@ class ClosedFrame(eqx.Module):
         """Return which particles are observed and not held."""
         return self.visible & ~self.held
 
+    def noise_variance(self, fields: Float[np.ndarray, "n modes"]) -> Float[np.ndarray, " n"]:
+        """Return the variance of a coordinate of each particle by white noise and the fields of smooth noise [m^2]."""
+        return 1 / np.maximum(np.asarray(self.precision)[:, 0, 0], 1.0) + np.sum(fields**2, axis=1)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Timed(FrameRecord):
@@ -68,3 +72,7 @@ class Timed(FrameRecord):
     def counted(self) -> Bool[np.ndarray, " n"]:
         """Return which particles are observed and not held."""
         return np.asarray(self.frame.counted)
+
+    def observing(self, y: Float[Array, "n 3"]) -> "Timed":
+        """Return the frame with other observed positions [m]."""
+        return replace(self, frame=replace(self.frame, y=y))

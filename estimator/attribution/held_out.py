@@ -13,12 +13,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
 
 from ..belief.gaussian_information import GaussianInformation
-from ..effects.frame_history import FrameHistory
 from ..parallel_map import parallel_map
 from .every_frame import directions, weighed
 from .frame_likelihood import FrameLikelihood
 from .gauss_newton import Fitted
-from .grasped_frames import ClosedFrame
 from .linear import columns_of
 from .persistence import carried
 from .problem import Point, Problem
@@ -142,18 +140,8 @@ def _as_predicted(problem: Problem, predicted: Point, frames: list[int]) -> Prob
     """Return a problem that observes some frames as predicted: intervals must not depend on what is seen there."""
     every = list(problem.history.frames)
     for k in frames:
-        every[k] = replace(every[k], frame=replace(every[k].frame, y=jnp.asarray(predicted.seen[k])))
-    return replace(problem, history=FrameHistory(every, np.asarray(problem.history.rest)))
-
-
-def noise_variance(problem: Problem, frame: ClosedFrame) -> Float[np.ndarray, " n"]:
-    """Return the variance of a coordinate of each particle by the assumed noise of observed positions [m^2]."""
-    return white_variance(frame) + np.sum(problem.assumed_noise**2, axis=1)
-
-
-def white_variance(frame: ClosedFrame) -> Float[np.ndarray, " n"]:
-    """Return the variance of a coordinate of each particle by the white noise of observed positions [m^2]."""
-    return 1 / np.maximum(np.asarray(frame.precision)[:, 0, 0], 1.0)
+        every[k] = every[k].observing(jnp.asarray(predicted.seen[k]))
+    return problem.with_frames(every)
 
 
 def rms(residual: Float[np.ndarray, "m 3"]) -> float:
@@ -217,7 +205,7 @@ def _variances(
     error = np.asarray(problem.sheet.balance.error(jnp.asarray(predicted.states[k])))
     fields = np.einsum("ani,nij->aj", by_force, np.asarray(likelihood.fields)) * problem.amplitude
     wrong = np.sum((by_force * error[None, :, None]) ** 2, axis=(1, 2)) + np.sum(fields**2, axis=1)
-    others = wrong.reshape(n, 3) + (white_variance(closed) + np.sum(problem.noise**2, axis=1))[:, None]
+    others = wrong.reshape(n, 3) + closed.noise_variance(problem.noise)[:, None]
     return Variances(fit=np.maximum(np.sum((by_fit @ known) * by_fit, axis=2), 0), others=new[:, None] * others)
 
 

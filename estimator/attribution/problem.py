@@ -162,6 +162,10 @@ class Problem:
         sd = self.force_sd * scales.force**0.5
         return replace(self, sheet=eqx.tree_at(lambda one: one.balance.force_sd, self.sheet, sd), scales=scales)
 
+    def with_frames(self, frames: list[Timed]) -> "Problem":
+        """Return the problem with other frames."""
+        return replace(self, history=FrameHistory(frames, np.asarray(self.history.rest)))
+
     def frames(self, parts: Iterable[int]) -> list[int]:
         """Return the frames of some parts."""
         return [k for k, one in enumerate(self.history.frames) if one.part in set(parts)]

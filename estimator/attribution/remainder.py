@@ -26,7 +26,7 @@ from scipy.optimize import minimize
 from ..map_rows import map_rows
 from .gauss_newton import Fitted
 from .grasped_frames import Timed
-from .held_out import from_rest, noise_variance
+from .held_out import from_rest
 
 TERMS = ("offset", "share", "drift", "walk", "white")
 """Names of the variances."""
@@ -109,7 +109,7 @@ def remainder_of_fit(fitted: Fitted) -> FittedRemainder:
         frames,
         np.array([np.asarray(timed.frame.y) for timed in frames]) - predicted.seen,
         np.isin(np.arange(len(frames)), known),
-        noise=np.array([noise_variance(problem, timed.frame) for timed in frames]),
+        noise=np.array([timed.frame.noise_variance(problem.assumed_noise) for timed in frames]),
     )
 
 

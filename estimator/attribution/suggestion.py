@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects.frame_history import USUAL_GAP, FrameHistory
+from ..effects.frame_history import USUAL_GAP
 from ..effects.sheet_model import look
 from ..physics.mesh import farthest_points
 from ..planning.information_config import SLANTED, UP, InformationPolicyConfig
@@ -90,18 +90,15 @@ def expected_log_bayes_factor(problem: Problem, fits: list[Fitted], frames: list
 
 def _simulated(problem: Problem, fitted: Fitted, frames: list[Timed]) -> list[Timed]:
     """Return the frames as they would be observed if a fit were right."""
-    at_rest = _observed_at_rest(_with_frames(problem, frames), fitted)
+    at_rest = _observed_at_rest(problem.with_frames(frames), fitted)
     frames = [
         replace(one, frame=eqx.tree_at(lambda f: (f.y, f.rotated), one.frame, (at_rest, at_rest))) for one in frames
     ]
     with_reports = [
         replace(one, frame=eqx.tree_at(lambda f: f.by_points, one.frame, jnp.asarray(False))) for one in frames
     ]
-    seen = _predicted(_with_frames(problem, with_reports), fitted, by_tool=True).seen
-    return [
-        replace(one, frame=eqx.tree_at(lambda f: f.y, one.frame, jnp.asarray(y)))
-        for one, y in zip(frames, seen, strict=True)
-    ]
+    seen = _predicted(problem.with_frames(with_reports), fitted, by_tool=True).seen
+    return [one.observing(jnp.asarray(y)) for one, y in zip(frames, seen, strict=True)]
 
 
 def _observed_at_rest(problem: Problem, fitted: Fitted) -> Float[Array, "n 3"]:
@@ -122,13 +119,9 @@ def _at_rest(problem: Problem) -> Float[np.ndarray, "frames n 3"]:
 
 def _cost(problem: Problem, fitted: Fitted, frames: list[Timed]) -> float:
     """Return the negative log likelihood of frames under a fit, without constants [nat]."""
-    problem = _with_frames(problem.with_scales(fitted.problem.scales), frames)
+    problem = problem.with_scales(fitted.problem.scales).with_frames(frames)
     point = _predicted(problem, fitted, by_tool=False)
     return 0.5 * misfit_under(problem, weighed(problem, point, list(range(len(frames)))), point)
-
-
-def _with_frames(problem: Problem, frames: list[Timed]) -> Problem:
-    return replace(problem, history=FrameHistory(frames, np.asarray(problem.history.rest)))
 
 
 def _frames(dataset: Dataset, place: int, pull: Float[np.ndarray, " 3"], *, gap: float, radius: float) -> list[Timed]:

@@ -85,4 +85,4 @@ def with_hidden(problem: Problem, hidden: dict[int, list[int]]) -> Problem:
     for k, particles in hidden.items():
         visible = timed[k].frame.visible.at[jnp.asarray(particles)].set(False)
         timed[k] = replace(timed[k], frame=eqx.tree_at(lambda f: f.visible, timed[k].frame, visible))
-    return replace(problem, history=FrameHistory(timed, np.asarray(problem.history.rest)))
+    return problem.with_frames(timed)

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +13,6 @@ from jiggle_mj.estimator.attribution.frame_likelihood import seen_noise
 from jiggle_mj.estimator.attribution.gauss_newton import start, weigh
 from jiggle_mj.estimator.attribution.held_out import predict_held_out, responses
 from jiggle_mj.estimator.blas import one_thread
-from jiggle_mj.estimator.effects.frame_history import FrameHistory
 from jiggle_mj.estimator.perception.smooth_modes import smooth_modes
 
 STEPS = {"attached": 0.02, "stretch": 0.05, "bending": 0.3}
@@ -70,8 +68,8 @@ def test_the_intervals_do_not_depend_on_what_is_seen_in_the_frames_that_they_are
     frames = list(problem.history.frames)
     for k in problem.frames({part}):
         higher = frames[k].frame.y + jnp.where(frames[k].frame.held[:, None], 0.0, 3e-3 * jnp.eye(3)[2:])
-        frames[k] = replace(frames[k], frame=replace(frames[k].frame, y=higher))
-    seen = replace(fitted, problem=replace(problem, history=FrameHistory(frames, np.asarray(problem.history.rest))))
+        frames[k] = frames[k].observing(higher)
+    seen = replace(fitted, problem=problem.with_frames(frames))
     with jax.enable_x64(True), one_thread():
         first, second = predict_held_out(fitted, part), predict_held_out(seen, part)
         assert abs(second.rms - first.rms) > 1e-3
@@ -91,8 +89,8 @@ def erring(problem, at: list[int], w: np.ndarray):
     frames, noise = list(problem.history.frames), jnp.asarray(problem.noise)
     for k in at:
         there = frames[k].frame
-        frames[k] = replace(frames[k], frame=eqx.tree_at(lambda f: f.y, there, there.y + seen_noise(there, noise) @ w))
-    return replace(problem, history=FrameHistory(frames, np.asarray(problem.history.rest)))
+        frames[k] = frames[k].observing(there.y + seen_noise(there, noise) @ w)
+    return problem.with_frames(frames)
 
 
 def test_errors_that_were_seen_persist(shared):
@@ -101,7 +99,7 @@ def test_errors_that_were_seen_persist(shared):
     problem, grasp = fitted.problem, fitted.problem.history.frames[list(fitted.equations)[-1]].grasp
     own = [k for k, one in enumerate(problem.history.frames) if one.grasp == grasp]
     frames = [replace(one, part=99 if k == own[-1] else one.part) for k, one in enumerate(problem.history.frames)]
-    problem = replace(problem, history=FrameHistory(frames, np.asarray(problem.history.rest)))
+    problem = problem.with_frames(frames)
     drifting = problem.with_scales(replace(problem.scales, autocorrelation=0.95))
     with jax.enable_x64(True), one_thread():
         fits = []
@@ -134,7 +132,7 @@ def test_what_the_fit_leaves_open_of_the_last_frame_is_known_by_its_error(light,
     with jax.enable_x64(True), one_thread():
         for autocorrelation in (0.0, 0.8):
             one = problem.with_scales(replace(problem.scales, autocorrelation=autocorrelation))
-            one = replace(one, history=FrameHistory(rests, np.asarray(problem.history.rest)))
+            one = one.with_frames(rests)
             point = replace(fitted.point, states=states, seen=states)
             known = replace(fitted, problem=one, point=point, weights=dict.fromkeys(range(3), fitted.weights[last]))
             variances.append(predict_held_out(known, 99).variances)

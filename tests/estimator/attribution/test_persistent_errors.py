@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +18,6 @@ from jiggle_mj.estimator.attribution.persistence import carried, drive
 from jiggle_mj.estimator.attribution.problem import Problem
 from jiggle_mj.estimator.blas import one_thread
 from jiggle_mj.estimator.effects import LIBRARY
-from jiggle_mj.estimator.effects.frame_history import FrameHistory
 from jiggle_mj.estimator.perception.smooth_modes import smooth_modes
 from tests.support.small_fit import with_hidden
 
@@ -188,9 +186,8 @@ def test_the_likeliest_noise_has_the_largest_posterior(grasp, smooth):
     for k in frames:
         a = 0.8 * a + 0.6 * smooth**0.5 * rng.normal(size=a.shape)
         there = timed[k].frame
-        shown = eqx.tree_at(lambda f: f.y, there, there.y + seen_noise(there, jnp.asarray(noise)) @ a)
-        timed[k] = replace(timed[k], frame=shown)
-    problem = replace(problem, history=FrameHistory(timed, np.asarray(problem.history.rest)))
+        timed[k] = timed[k].observing(there.y + seen_noise(there, jnp.asarray(noise)) @ a)
+    problem = problem.with_frames(timed)
     with jax.enable_x64(True), one_thread():
 
         def weighed_by(scales: NoiseScales) -> Weighed:
@@ -225,7 +222,7 @@ def test_a_fold_is_weighed_as_if_its_frames_had_never_been(grasp):
     fitted, problem, frames = grasp
     problem = problem.with_scales(replace(problem.scales, autocorrelation=0.9))
     timed = [replace(one, part=99 if k == frames[1] else one.part) for k, one in enumerate(problem.history.frames)]
-    problem = replace(problem, history=FrameHistory(timed, np.asarray(problem.history.rest)))
+    problem = problem.with_frames(timed)
     kept = [frames[0], *frames[2:]]
     with jax.enable_x64(True), one_thread():
         whole = linearise_at(problem, fitted.named, fitted.point, frames)
